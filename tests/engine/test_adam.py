@@ -5,14 +5,14 @@ import pytest
 from engine_scenes import on_one_thread, relative_error
 
 from sags_node.engine.adam import AdamState, adam_step
-from sags_node.types import F32, F64, I64
+from sags_node.types import F32, F64
 
 ROWS, COLUMNS = 40, 19  # a vector and a rest
 BETAS = (0.8, 0.99)
 
 
-def start(seed: int = 0) -> tuple[F32, F32, AdamState]:
-    rng = np.random.default_rng(seed)
+def start() -> tuple[F32, F32, AdamState]:
+    rng = np.random.default_rng(0)
     values = rng.normal(size=(ROWS, COLUMNS)).astype(np.float32)
     rates = rng.uniform(1e-3, 1e-1, COLUMNS).astype(np.float32)
     return values, rates, AdamState.new(ROWS, COLUMNS)
@@ -47,8 +47,7 @@ def test_dense_steps_are_torch_adam() -> None:
     assert relative_error(values - before, torch_adam(before, rates, given) - before) < 1e-5
 
 
-@pytest.mark.parametrize("integer", [np.int64, np.int32])
-def test_each_row_is_an_optimiser_that_saw_its_own_steps_only(integer: type) -> None:
+def test_each_row_is_an_optimiser_that_saw_its_own_steps_only() -> None:
     values, rates, state = start()
     before = values.copy()
     rng = np.random.default_rng(2)
@@ -60,21 +59,13 @@ def test_each_row_is_an_optimiser_that_saw_its_own_steps_only(integer: type) -> 
         gradient[rows] = gradients(step)[rows]
         for row in rows:
             seen[row].append(gradient[row : row + 1])
-        assert adam_step(values, gradient, state, rates, rows=rows.astype(integer), betas=BETAS) == 0
+        rows = rows.astype(np.int32 if step % 2 else np.int64)
+        assert adam_step(values, gradient, state, rates, rows=rows, betas=BETAS) == 0
     for row in range(ROWS):
         expected = torch_adam(before[row : row + 1], rates, seen[row]) - before[row]
         np.testing.assert_allclose((values - before)[row], expected[0], rtol=1e-4, atol=2e-6)
     # the first step of a row is one rate long however late it comes
     np.testing.assert_allclose(np.abs(values - before)[7], rates, rtol=1e-3)
-
-
-def test_nothing_moves_without_a_gradient() -> None:
-    values, rates, state = start()
-    before = values.copy()
-    adam_step(values, np.zeros_like(values), state, rates)
-    np.testing.assert_array_equal(values, before)
-    adam_step(values, gradients(0), state, rates, rows=np.zeros(0, np.int64))
-    np.testing.assert_array_equal(values, before)
 
 
 @pytest.mark.parametrize(
@@ -113,14 +104,12 @@ def test_a_broken_row_sits_out_and_starts_anew(place: str, broken: float) -> Non
 def test_same_bits_for_one_and_all_threads() -> None:
     def run() -> F32:
         values, rates, state = start()
-        rows: I64 = np.arange(0, ROWS, 3)
         for step in range(5):
-            adam_step(values, gradients(step), state, rates, rows=rows)
+            adam_step(values, gradients(step), state, rates, rows=np.arange(0, ROWS, 3))
         return values
 
     together = run()
-    alone = on_one_thread(run)
-    np.testing.assert_array_equal(alone, together)
+    np.testing.assert_array_equal(on_one_thread(run), together)
 
 
 def test_shapes_are_checked() -> None:

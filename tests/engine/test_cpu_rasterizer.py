@@ -1,27 +1,26 @@
-"""The CPU's rasteriser beyond what all must do (`test_rasterizer.py`): which splats rounding cuts, threads,
-kernels that compile once, room that grows, and wrong use."""
+"""The CPU's rasteriser beyond what all must do (`test_rasterizer.py`): spherical harmonics by their
+definition, views, threads and wrong use."""
 
 import dataclasses
-import threading
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import cv2
-import numba
 import numpy as np
 import pytest
-import torch
 from engine_scenes import (
     DERIVATIVES,
     EXPONENTIAL,
-    INPUTS,
     camera,
     cotangents,
-    draw_and_differentiate,
     on_one_thread,
+    one_gaussian,
     random_gaussians,
     rasterize,
     rows,
-    truth,
     with_filter,
     with_view_dependence,
 )
@@ -30,16 +29,14 @@ from rounding import after
 
 from benchmarks.kernels import reference
 from sags_node import geometry
-from sags_node.config.schema import LaunchConfig
-from sags_node.engine.interface import MIN_ALPHA
-from sags_node.engine.rasterizer import binning, compositing, cpu, projection, projection_backward, smoothing
+from sags_node.engine.rasterizer import cpu
 from sags_node.engine.rasterizer import spherical_harmonics as harmonics
 from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH, make_rasterizer, to_view
+from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import UsageError
-from sags_node.kernels.jit import parallel_kernel, take
+from sags_node.kernels.jit import read_only
 from sags_node.kernels.threads import configure_threads, leave_a_core, thread_count
-from sags_node.pipeline.warm_up import warm_up
-from sags_node.types import I64, Bool, Camera, Gaussians
+from sags_node.types import F32, F64, Bool, Camera, Colours, Gaussians
 
 WIDE = camera(100, 77, focal=110.0, moved=True)  # no whole number of tiles
 TURNED = camera(100, 77, focal=95.0)
@@ -64,47 +61,71 @@ def assert_same_bits(found: list[Any], expected: list[Any]) -> None:
         np.testing.assert_array_equal(a, b)
 
 
-# ---- the arithmetic ----------------------------------------------------------------------------------------
+def basis(directions: F64) -> NDArray[np.float32]:
+    """Y_1 to Y_15 [M, 15] as the kernel has them."""
+    means = directions.astype(np.float32)
+    black, found = np.zeros_like(means), []
+    for k in range(15):
+        sh_rest, seen = np.zeros((len(means), 15, 3), np.float32), np.empty_like(means)
+        sh_rest[:, k] = 1
+        harmonics.color(*map(read_only, (means, black, sh_rest)), (np.float32(0),) * 3, seen)
+        found.append(seen[:, 0])
+    return np.stack(found, 1)
 
 
-def alphas(gaussians: Gaussians, view: Camera) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Of the twin: [pixels, splats], 0 where cut; and which Gaussians the splats are."""
-    inputs = [torch.tensor(getattr(gaussians, name), dtype=torch.float64) for name in INPUTS]
-    splats = reference.project(view, inputs)
-    alpha, _, touching, _ = reference.alphas(splats, 0, 0, view.width, view.height)
-    return alpha.numpy(), splats.rows[touching].numpy()
+def test_basis_has_the_order_and_the_signs_of_3d_gaussian_splatting() -> None:
+    """Degree by degree, order from -l to l, with the Condon-Shortley phase, orthonormal on the sphere:
+    Legendre's polynomials."""
+    rng = np.random.default_rng(2)
+    directions = rng.normal(size=(50, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    x, y, z = directions.T
+    angle, flat = np.arctan2(y, x), np.hypot(x, y)
+    expected = []
+    for degree in (1, 2, 3):
+        for order in range(-degree, degree + 1):
+            m = abs(order)
+            legendre = np.polynomial.Legendre.basis(degree)
+            height = legendre.deriv(m)(z) if m else legendre(z)
+            share = math.factorial(degree - m) / math.factorial(degree + m)
+            scale = (-1) ** m * math.sqrt((2 - (m == 0)) * (2 * degree + 1) / (4 * math.pi) * share)
+            turn = np.sin(m * angle) if order < 0 else np.cos(m * angle)
+            expected.append(scale * flat**m * height * turn)
+    np.testing.assert_allclose(basis(directions), np.stack(expected, 1), atol=1.8 * after(12))
 
 
-@pytest.mark.parametrize("seed", [20, 23, 25, 28])
-def test_rounding_changes_no_more_than_whether_a_splat_is_cut(
-    seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Where alpha is 1/255, rounding decides whether a splat shows. In a large scene some always are so, and
-    one of them moves gradients by more than all rounding. Image and gradients are then those of the twin
-    that decides likewise, and the image and its gradients decide alike. Here one splat meets the cut in one
-    pixel."""
-    view = camera()
-    gaussians = random_gaussians(seed, 60, view)
-    alpha, rows = alphas(gaussians, view)
-    pixel, splat = np.unravel_index(np.abs(alpha - 0.01).argmin(), alpha.shape)  # near its rim
-    opacities = gaussians.opacities.copy()
-    opacities[rows[splat]] *= MIN_ALPHA / alpha[pixel, splat]
-    gaussians = dataclasses.replace(gaussians, opacities=opacities)
-    found, found_gradients = draw_and_differentiate(gaussians, view, seed=seed)
+def test_direction_runs_from_the_camera_to_the_gaussian_in_the_world() -> None:
+    """One Gaussian with a green that grows along the world's z, seen from both sides."""
+    sh_rest = np.zeros((1, 3, 3), np.float32)
+    sh_rest[0, 1, 1] = 0.3
+    gaussians = dataclasses.replace(one_gaussian(np.array([0, 0, 0.07]), 0.002), sh_rest=sh_rest)
+    behind = np.diag([-1.0, 1.0, -1.0, 1.0])
+    behind[2, 3] = 0.14
+    for T, side in [(np.eye(4), 1), (behind, -1)]:
+        view = Camera(41, 41, np.array([[60.0, 0, 20], [0, 60, 20], [0, 0, 1]]), T)
+        seen = rasterize(gaussians, view).rgb[20, 20]
+        green = 0.5 + side * 0.3 * math.sqrt(3 / (4 * math.pi))
+        np.testing.assert_allclose(seen, 255 * np.array([0.8, green, 0.2]), atol=0.51)
 
-    wrong = []
-    for moved_cut in (1 - 1e-4, 1 + 1e-4):  # far more than rounding
-        monkeypatch.setattr(reference, "MIN_ALPHA", moved_cut * MIN_ALPHA)
-        shown = np.count_nonzero(alphas(gaussians, view)[0])
-        true = truth(gaussians, view, seed)
-        off = [np.abs(found - true.planes).max() / true.off.max()]
-        for name in (*INPUTS, "contribution"):
-            error = np.linalg.norm(found_gradients[name] - true.gradients[name])
-            off.append(error / true.gradients_within[name])
-        wrong.append((shown, max(off)))
-    (with_it, shown_off), (without, cut_off) = wrong
-    assert with_it == without + 1  # no other is near the cut
-    assert min(shown_off, cut_off) <= 1 < max(shown_off, cut_off)
+
+@pytest.mark.parametrize("corner", [(2.0, 2.0), (47.5, 31.5)])
+def test_a_crowd_in_one_corner(corner: tuple[float, float]) -> None:
+    """2000 Gaussians on a few pixels, all pairs in one or four tiles; the storage order does not matter
+    either."""
+    gaussians = random_gaussians(3, 2000, WIDE)
+    rng = np.random.default_rng(4)
+    pixels = corner + rng.uniform(-3, 3, (2000, 2))
+    gaussians.means[:] = geometry.unproject(WIDE, pixels, rng.uniform(0.05, 0.09, 2000))
+    planes = make_rasterizer("numba", 100, 77).forward(gaussians, WIDE).copy()
+    assert planes[4].max() > 0.99
+    true = reference.ReferenceRasterizer().forward(gaussians, WIDE)
+    # a tile stops at a transmittance of 1e-4
+    np.testing.assert_allclose(planes, true, rtol=0, atol=1e-4 + 2 * EXPONENTIAL)
+    shuffled = rows(gaussians, np.random.default_rng(5).permutation(2000))
+    np.testing.assert_array_equal(make_rasterizer("numba", 100, 77).forward(shuffled, WIDE), planes)
+
+
+# ---- views ------------------------------------------------------------------------------------------------
 
 
 def test_view_is_normalised_by_coverage() -> None:
@@ -116,13 +137,9 @@ def test_view_is_normalised_by_coverage() -> None:
     drawn = to_view(planes, view, 5, 6)
     assert drawn.rgb[0, 0].tolist() == [128, 64, 255]
     assert drawn.depth[0, 0] == pytest.approx(0.05, rel=after(4))
-    assert drawn.rgb[1, 1].tolist() == [64, 64, 64]
-    assert drawn.depth[1, 1] == 0
-    assert not drawn.rgb[2, 2].any()
-    assert drawn.alpha[2, 2] == np.float32(1e-4)
+    assert drawn.rgb[1, 1].tolist() == [64, 64, 64] and drawn.depth[1, 1] == 0
+    assert not drawn.rgb[2, 2].any() and drawn.alpha[2, 2] == np.float32(1e-4)
     assert (drawn.frame_id, drawn.t_capture_ns) == (5, 6)
-    planes[:] = 0.9
-    assert drawn.rgb[0, 0, 0] == 128  # fresh arrays
 
 
 def test_a_pixel_between_gaussians_has_its_own_depth_where_all_beside_it_have_one() -> None:
@@ -140,33 +157,52 @@ def test_a_pixel_between_gaussians_has_its_own_depth_where_all_beside_it_have_on
     assert depth[0] == pytest.approx(0.05, rel=after(4))
 
 
-def test_buffers_grow_when_a_picture_needs_more_pairs() -> None:
-    """100 Gaussians that all cover all 54 tiles, from a fresh rasteriser with room for 4096 pairs."""
-    view = camera(width=140, height=180, focal=150.0)
-    gaussians = random_gaussians(1, 100, view)
-    gaussians = dataclasses.replace(
-        gaussians, scales=np.full((100, 3), 0.2, np.float32), opacities=np.full(100, 0.02, np.float32)
-    )
-    planes, found = draw_and_differentiate(gaussians, view)
-    assert (found["contribution"] > 0).all()
-    truth(gaussians, view, moves=1).check(planes, found, ["colors", "contribution"])
+WIDTH, HEIGHT = 96, 64
 
 
-@pytest.mark.parametrize("corner", [(2.0, 2.0), (97.0, 74.0), (47.5, 31.5)])
-def test_a_crowd_in_one_corner(corner: tuple[float, float]) -> None:
-    """2000 Gaussians on a few pixels, all pairs in one or four tiles; the storage order does not matter
-    either."""
-    gaussians = random_gaussians(3, 2000, WIDE)
-    rng = np.random.default_rng(4)
-    pixels = corner + rng.uniform(-3, 3, (2000, 2))
-    gaussians.means[:] = geometry.unproject(WIDE, pixels, rng.uniform(0.05, 0.09, 2000))
-    planes = make_rasterizer("numba", 100, 77).forward(gaussians, WIDE).copy()
-    assert planes[4].max() > 0.99
-    true = reference.ReferenceRasterizer().forward(gaussians, WIDE)
-    # a tile stops at a transmittance of 1e-4
-    np.testing.assert_allclose(planes, true, rtol=0, atol=1e-4 + 2 * EXPONENTIAL)
-    shuffled = rows(gaussians, np.random.default_rng(5).permutation(2000))
-    np.testing.assert_array_equal(make_rasterizer("numba", 100, 77).forward(shuffled, WIDE), planes)
+def waves() -> F32:
+    """[H, W, 3] 0..255: a wave of 8 px along each axis, one for each channel."""
+    v, u = np.indices((HEIGHT, WIDTH))
+    phase = np.stack([u, v, u + v], -1) * (2 * np.pi / 8)
+    return (127.5 + 100 * np.cos(phase)).astype(np.float32)
+
+
+def test_what_is_enlarged_shows_the_middles_of_what_was_averaged() -> None:
+    """Where two are averaged along each axis, a wave of 8 px keeps cos(pi / 8) of its height: 7.6 % are lost
+    for each axis that it runs along. Taking out what the second difference says leaves less than half."""
+    picture = waves()
+    means = picture.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean((1, 3))
+    small = np.rint(means).astype(np.uint8)
+    whole = Colours(small, WIDTH, HEIGHT).whole.astype(np.float32)
+    blurred = cv2.resize(small, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC).astype(np.float32)
+    inside = np.s_[8:-8, 8:-8]
+    error, before = (np.sqrt(np.mean(np.square(each - picture)[inside])) for each in (whole, blurred))
+    assert error < 0.5 * before
+
+
+@pytest.mark.parametrize("scale", [1, 0.75, 0.5])
+def test_few_pixels_are_the_same_whether_somebody_asked_for_all(scale: float) -> None:
+    size = round(scale * WIDTH), round(scale * HEIGHT)
+    small = cv2.resize(waves(), size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+    colours = Colours(small, WIDTH, HEIGHT)
+    few = colours.every(8)
+    assert few.shape == (HEIGHT // 8, WIDTH // 8, 3)
+    enlarged = cv2.resize(small, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+    assert np.abs(few.astype(int) - enlarged[::8, ::8]).max() <= 2  # another rounding of the weights
+    assert colours.whole.shape == (HEIGHT, WIDTH, 3)
+    assert np.array_equal(colours.every(8), few)
+
+
+def test_a_view_has_its_own_memory() -> None:
+    """Planes are overwritten by the next drawing, before somebody asks for the colours of this one."""
+    planes = np.empty((5, HEIGHT // 2, WIDTH // 2), np.float32)
+    planes[:] = np.array([0.4, 0.2, 0.6, 0.05, 0.8])[:, None, None]
+    view = to_view(planes, camera(WIDTH, HEIGHT), 0, 0)
+    expected = colours_of(planes)
+    planes[:] = 0
+    assert view.rgb is view.rgb  # enlarged once
+    assert np.abs(view.rgb - 255 * expected[0, 0]).max() <= 0.5 + 1e-3  # rounded
+    assert view.depth.min() == view.depth.max() == pytest.approx(0.0625)
 
 
 # ---- sharing the work --------------------------------------------------------------------------------------
@@ -181,23 +217,6 @@ def test_same_bits_however_many_share_the_work(tiles: Bool | None, monkeypatch: 
         assert_same_bits(everything(scene(), WIDE, tiles), expected)
 
 
-@parallel_kernel
-def _mark(next_item: I64, taken: I64, workers: int) -> None:
-    for _ in numba.prange(workers):
-        item = take(next_item, 1)
-        while item < taken.size:
-            taken[item] += 1
-            item = take(next_item, 1)
-
-
-def test_every_item_is_taken_once() -> None:
-    taken, next_item = np.zeros(100_000, np.int64), np.zeros(1, np.int64)
-    workers = 8
-    _mark(next_item, taken, workers)
-    assert (taken == 1).all()
-    assert next_item[0] == taken.size + workers
-
-
 def test_threads_with_rasterizers_of_their_own() -> None:
     """Four Python threads, other scenes, cameras, tiles and numbers of cores, at once."""
     cases: list[tuple[Gaussians, Camera, Bool | None]] = [
@@ -207,23 +226,14 @@ def test_threads_with_rasterizers_of_their_own() -> None:
         (random_gaussians(4, 400, WIDE), WIDE, None),
     ]
     expected = [everything(*case) for case in cases]
-    failures: list[BaseException] = []
 
     def repeat(index: int) -> None:
-        try:
-            configure_threads(1 + index % 2)
-            for _ in range(10):
-                assert_same_bits(everything(*cases[index]), expected[index])
-        except BaseException as error:  # carried to the test's own thread
-            failures.append(error)
+        configure_threads(1 + index % 2)
+        for _ in range(10):
+            assert_same_bits(everything(*cases[index]), expected[index])
 
-    threads = [threading.Thread(target=repeat, args=(index,)) for index in range(len(cases))]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(60)
-    assert not any(thread.is_alive() for thread in threads)
-    assert not failures, failures[0]
+    with ThreadPoolExecutor(len(cases)) as pool:
+        list(pool.map(repeat, range(len(cases)), timeout=60))
 
 
 def test_beside_others_one_core_is_left_for_kernels_and_for_opencv() -> None:
@@ -238,63 +248,34 @@ def test_beside_others_one_core_is_left_for_kernels_and_for_opencv() -> None:
         cv2.setNumThreads(of_opencv)
 
 
-def test_kernels_compile_once_and_warm_up_has_done_it() -> None:
-    """Also for frozen arrays and other float types, which are other types to Numba."""
-    warm_up(LaunchConfig())
-    kernels: list[Any] = [
-        projection.project, projection_backward.project_backward, binning.sort_by_depth, binning.emit_pairs,
-        binning.sort_into_tiles, compositing.composite, compositing.composite_backward, smoothing.smooth,
-        smoothing.smooth_backward, harmonics.color, harmonics.color_backward,
-    ]  # fmt: skip
-    compiled = [len(kernel.signatures) for kernel in kernels]
-    plain, full = random_gaussians(1, 50, WIDE), scene(30)
-    for gaussians in (plain, full):
-        for name in (*INPUTS, "sh_rest", "smoothing"):
-            if getattr(gaussians, name) is not None:
-                getattr(gaussians, name).flags.writeable = False
-    draw_and_differentiate(plain, WIDE)
-    rasterize(plain, WIDE)
-    assert [len(kernel.signatures) for kernel in kernels] == compiled
-    wide = {name: getattr(full, name).astype(np.float64) for name in (*INPUTS, "sh_rest", "smoothing")}
-    for gaussians in (full, dataclasses.replace(full, **wide)):
-        draw_and_differentiate(gaussians, WIDE)
-        smoothing.bake_filter(gaussians)
-    assert [len(kernel.signatures) for kernel in kernels] == [1] * len(kernels)
-
-
 # ---- wrong use ---------------------------------------------------------------------------------------------
-
-
 def test_wrong_input_is_explained() -> None:
     gaussians = scene(5)
-    rasterizer = make_rasterizer("numba", 100, 77)
     v_planes, weight = cotangents(WIDE, 0)
-    with pytest.raises(UsageError, match="call forward before backward"):
-        rasterizer.backward(v_planes, weight)
-    with pytest.raises(UsageError, match="call forward before median"):
-        rasterizer.median()
-    for changes, words in [
+    fresh, drawn = (make_rasterizer("numba", 100, 77) for _ in range(2))
+    drawn.forward(gaussians, WIDE)
+    tiles = np.ones(SHAPE)
+    nowhere = Camera(100, 77, WIDE.K, np.full((4, 4), np.nan))
+    spoilt: list[tuple[dict[str, Any], str]] = [
         ({"quats": gaussians.means}, r"quats has shape \[5, 3\], expected \[5, 4\]"),
         ({"smoothing": np.zeros(6, np.float32)}, r"smoothing has shape \[6\], expected \[5\]"),
         *(({"sh_rest": np.zeros(shape, np.float32)}, "sh_rest has shape")
           for shape in [(5, 4, 3), (4, 3, 3), (5, 3), (5, 3, 4)]),
-    ]:  # fmt: skip
+    ]  # fmt: skip
+    mistakes: list[tuple[Callable[[], object], str]] = [
+        *((partial(fresh.forward, dataclasses.replace(gaussians, **changes), WIDE), words)
+          for changes, words in spoilt),
+        (lambda: fresh.backward(v_planes, weight), "call forward before backward"),
+        (fresh.median, "call forward before median"),
+        (lambda: fresh.forward(gaussians, camera(width=50)), "draws 100x77 px, the camera has 50x40"),
+        (lambda: fresh.forward(gaussians, WIDE, tiles.T > 0), r"bool \[7, 3\], expected bool \[3, 7\]"),
+        (lambda: fresh.forward(gaussians, WIDE, tiles), "tiles is float64"),  # type: ignore[arg-type]
+        (lambda: fresh.forward(gaussians, nowhere), "NaN or infinity"),
+        (lambda: drawn.backward(v_planes[:, :3, :3], weight), "v_planes has shape"),
+        (lambda: drawn.backward(v_planes, weight.T), r"weight has shape \[100, 77\], expected \[77, 100\]"),
+        (lambda: make_rasterizer("cudnn", 8, 8), "unknown engine backend 'cudnn'; choose"),
+        (lambda: make_rasterizer("numba", 0, 8), "0x8"),
+    ]  # fmt: skip
+    for wrong, words in mistakes:
         with pytest.raises(UsageError, match=words):
-            rasterizer.forward(dataclasses.replace(gaussians, **changes), WIDE)
-    with pytest.raises(UsageError, match="draws 100x77 px, the camera has 50x40"):
-        rasterizer.forward(gaussians, camera(width=50))
-    with pytest.raises(UsageError, match=r"tiles is bool \[7, 3\], expected bool \[3, 7\]"):
-        rasterizer.forward(gaussians, WIDE, np.ones(SHAPE[::-1], bool))
-    with pytest.raises(UsageError, match="tiles is float64"):
-        rasterizer.forward(gaussians, WIDE, np.ones(SHAPE))  # type: ignore[arg-type]  # that is the mistake
-    with pytest.raises(UsageError, match="NaN or infinity"):
-        rasterizer.forward(gaussians, Camera(100, 77, WIDE.K, np.full((4, 4), np.nan)))
-    rasterizer.forward(gaussians, WIDE)
-    with pytest.raises(UsageError, match="v_planes has shape"):
-        rasterizer.backward(np.zeros((5, 3, 3), np.float32), weight)
-    with pytest.raises(UsageError, match=r"weight has shape \[100, 77\], expected \[77, 100\]"):
-        rasterizer.backward(v_planes, weight.T)
-    with pytest.raises(UsageError, match="unknown engine backend 'cudnn'; choose"):
-        make_rasterizer("cudnn", 8, 8)
-    with pytest.raises(UsageError, match="0x8"):
-        make_rasterizer("numba", 0, 8)
+            wrong()

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 from engine_scenes import on_one_thread
-from rounding import after, exact
+from rounding import after, moved
 
 from sags_node.engine.losses.pieces import PIECE
 from sags_node.engine.losses.tissue import tissue_loss
 from sags_node.mapping.refiner import DEPTH_SCALE, DEPTH_WEIGHT
-from sags_node.types import F32
+from sags_node.types import F32, F64
 
 HEIGHT, WIDTH = 23, 31
 
@@ -66,8 +66,8 @@ def run(request: pytest.FixtureRequest) -> Run:
     return found
 
 
-def twin(planes: Any, image: Any, tissue: Any, depth: Any) -> list[Any]:
-    """The gradient of the stated loss by each of the planes, in float64."""
+def twin(planes: Any, image: Any, tissue: Any, depth: Any) -> F64:
+    """The gradient [5, H, W] of the stated loss by the planes."""
     import torch
 
     from benchmarks.kernels import reference
@@ -75,11 +75,11 @@ def twin(planes: Any, image: Any, tissue: Any, depth: Any) -> list[Any]:
     drawn = torch.tensor(planes, dtype=torch.float64, requires_grad=True)
     seen = (torch.tensor(array) for array in (image / 255, tissue, depth))
     loss = reference.tissue_loss(drawn, *seen, DEPTH_WEIGHT, DEPTH_SCALE)
-    (gradient,) = torch.autograd.grad(loss, drawn)
-    return list(gradient.numpy())
+    return np.asarray(torch.autograd.grad(loss, drawn)[0].numpy())
 
 
 def test_mean_residual_and_weight(run: Run) -> None:
+    """Of tissue that something covers; without any there is no loss and no gradient."""
     inputs = frame()
     mean, _, weight = run(inputs)
     coverage = inputs["planes"][4]
@@ -89,14 +89,8 @@ def test_mean_residual_and_weight(run: Run) -> None:
     assert mean == pytest.approx(expected, rel=after(3 * PIECE))  # pieces are added up in float64
     np.testing.assert_allclose(weight[counts], 1 / coverage[counts], rtol=after(2))
     assert not weight[~counts].any()
-
-
-def test_no_tissue_no_gradient(run: Run) -> None:
-    inputs = frame() | {"tissue": np.zeros((HEIGHT, WIDTH), np.bool_)}
-    mean, v_planes, weight = run(inputs)
-    assert mean == 0
-    assert not v_planes.any()
-    assert not weight.any()
+    mean, v_planes, weight = run(inputs | {"tissue": np.zeros_like(counts)})
+    assert mean == 0 and not v_planes.any() and not weight.any()
 
 
 @pytest.mark.parametrize("where", ["depth", *range(5)])
@@ -116,7 +110,6 @@ def test_broken_pixels_are_left_out(run: Run, where: str | int, value: float) ->
     expected, v_clean, _ = run(clean)
     mean, v_broken, weight = run(broken)
     assert mean == expected
-    assert np.isfinite(v_broken).all()
     assert np.isfinite(weight).all()
     np.testing.assert_array_equal(v_broken, v_clean)
 
@@ -133,14 +126,17 @@ def test_kernel_writes_the_gradient_of_the_stated_loss(run: Run, height: int, wi
     }
     inputs["tissue"][0, 0], inputs["planes"][4, 0, 0] = True, 0.5
     inputs["image"] = np.random.default_rng(1).integers(0, 256, (height, width, 3), np.uint8)
-    _, v_planes, _ = run(inputs)
-    for plane, true in enumerate(exact(twin, inputs)):
-        true.check(v_planes[plane], plane)
+    _, found, _ = run(inputs)
+    true, within = twin(**inputs), np.zeros(5)
+    for move in range(3):
+        rng = np.random.default_rng(move)
+        near = twin(**{name: moved(array, rng) for name, array in inputs.items()})
+        within = np.maximum(within, np.linalg.norm(near - true, axis=(1, 2)))
+    error, size = (np.linalg.norm(each, axis=(1, 2)) for each in (found - true, true))
+    assert (error <= within + after(1) * size).all(), (error, within)
 
 
 def test_same_bits_for_one_and_all_threads() -> None:
     inputs = frame()
-    together = on_cpu(inputs)
-    alone = on_one_thread(lambda: on_cpu(inputs))
-    assert alone[0] == together[0]
-    np.testing.assert_array_equal(alone[1], together[1])
+    for together, alone in zip(on_cpu(inputs), on_one_thread(lambda: on_cpu(inputs)), strict=True):
+        np.testing.assert_array_equal(alone, together)

@@ -3,6 +3,8 @@ float64, a closed form, or the same scene without what was spoilt."""
 
 import dataclasses
 import importlib
+from collections.abc import Iterator
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -29,7 +31,7 @@ from warp_on_cpu import use_warp_on_cpu
 
 from benchmarks.kernels.reference import ReferenceRasterizer
 from sags_node import geometry
-from sags_node.engine.interface import MAX_OPACITY, MIN_ALPHA, NEAR_PLANE
+from sags_node.engine.interface import MIN_ALPHA, NEAR_PLANE
 from sags_node.engine.rasterizer.rasterize import (
     TILE_HEIGHT,
     TILE_WIDTH,
@@ -38,32 +40,28 @@ from sags_node.engine.rasterizer.rasterize import (
     make_rasterizer,
 )
 from sags_node.errors import SagsError
-from sags_node.types import F32, Bool, Camera, Gaussians
+from sags_node.types import F32, Camera, Gaussians
+
+VIEW = camera()  # 48 x 40 px
+MODULES = {  # where each has its MAX_PAIRS
+    "numba": "sags_node.engine.rasterizer.cpu",
+    "warp": "sags_node.engine.gpu.rasterizer",
+}
 
 
 @dataclasses.dataclass(frozen=True)
 class Backend:
-    """One of them, and a scene's size that suits it."""
+    """One of them."""
 
     name: str
-    width: int
-    height: int
-    count: int  # Gaussians
-    module: str  # where its MAX_PAIRS stands
-
-    def camera(self, **options: Any) -> Camera:
-        return camera(self.width, self.height, **options)
-
-    def scene(self, seed: int, view: Camera, spread: float = 1.0) -> Gaussians:
-        return random_gaussians(seed, self.count, view, spread)
 
     def rasterizer(self, view: Camera) -> Rasterizer:
         return make_rasterizer(self.name, view.width, view.height)
 
-    def draw(self, gaussians: Gaussians, view: Camera, **options: Any) -> tuple[F32, dict[str, Any]]:
+    def draw(self, gaussians: Gaussians, view: Camera = VIEW, **options: Any) -> tuple[F32, dict[str, Any]]:
         return draw_and_differentiate(gaussians, view, self.name, **options)
 
-    def agrees(self, gaussians: Gaussians, view: Camera, shown: float = 0.05, **options: Any) -> None:
+    def agrees(self, gaussians: Gaussians, view: Camera, shown: float, **options: Any) -> None:
         """Planes, and gradients of a random cotangent, with the float64 twin; `shown`: the least coverage of
         some pixel."""
         true = truth(gaussians, view, **options)
@@ -71,12 +69,11 @@ class Backend:
         true.check(*self.draw(gaussians, view, **options))
 
 
-@pytest.fixture(params=["numba", "warp"])
+@pytest.fixture(params=MODULES)
 def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Backend:
-    if request.param == "numba":
-        return Backend("numba", 48, 40, 60, "sags_node.engine.rasterizer.cpu")
-    use_warp_on_cpu(monkeypatch)
-    return Backend("warp", 48, 40, 60, "sags_node.engine.gpu.rasterizer")
+    if request.param == "warp":
+        use_warp_on_cpu(monkeypatch)
+    return Backend(request.param)
 
 
 def same(found: dict[str, Any], true: dict[str, Any], keep: Any = ...) -> None:
@@ -97,7 +94,7 @@ def scene_of(gaussians: Gaussians, degree: int, filtered: bool, seed: int = 0) -
 # ---- the arithmetic ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize(
     ("degree", "filtered", "antialias", "moved"),
     [(0, False, True, False), (0, False, True, True), (0, False, False, True), (1, True, False, True),
@@ -107,87 +104,72 @@ def test_agrees_with_the_float64_twin(
     backend: Backend, seed: int, degree: int, filtered: bool, antialias: bool, moved: bool
 ) -> None:
     """Every derivative, all degrees, both filters on and off."""
-    view = backend.camera(moved=moved)
-    gaussians = scene_of(backend.scene(seed, view), degree, filtered, seed)
+    view = camera(moved=moved)
+    gaussians = scene_of(random_gaussians(seed, 60, view), degree, filtered, seed)
     backend.agrees(gaussians, view, seed=seed, antialias=antialias, shown=0.25)
 
 
-def test_agrees_on_a_larger_scene(backend: Backend) -> None:
-    view = camera(width=64, height=48, focal=80.0)
-    backend.agrees(with_filter(random_gaussians(4, 110, view, spread=0.7)), view)
+def extremes() -> Iterator[tuple[str, Camera, Gaussians, float]]:
+    """What it shows, a camera, a scene, and the least coverage of some pixel."""
+    for scale, filtered in product((1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0), (False, True)):
+        # six turned Gaussians whose axes differ by 10, through a lens that can show 10 micrometres
+        view = camera(focal=2000.0)
+        axes = np.tile(np.array([scale, scale / 10, scale / 3], np.float32), (6, 1))
+        smoothing = np.full(6, 0.01 * scale**2, np.float32) if filtered else None
+        scene = dataclasses.replace(random_gaussians(3, 6, view), scales=axes, smoothing=smoothing)
+        yield f"from a vanishing dot to a wall: {scale} m, {filtered=}", view, scene, 0.05
+    flat = [(1e-3, 1e-7, 2e-3), (1e-3, 1.1e-3, 1e-7), (3e-3, 3e-4, 3e-7), (0.1, 1e-5, 1e-3)]
+    for axes_m, filtered in product(flat, (False, True)):
+        scene = dataclasses.replace(
+            random_gaussians(7, 8, VIEW),
+            scales=np.tile(np.array(axes_m, np.float32), (8, 1)),
+            opacities=np.full(8, 0.97, np.float32),
+            smoothing=np.full(8, 1e-12, np.float32) if filtered else None,  # of a micrometre
+        )
+        yield f"flat as paper, thin as a thread: {axes_m} m, {filtered=}", VIEW, scene, 0.01
+    for size in [(1, 1), (1, 70), (33, 1), (15, 31), (16, 32), (17, 33), (17, 65), (100, 7)]:
+        view = camera(*size, focal=30.0, moved=True)
+        yield f"of odd size: {size}", view, scene_of(random_gaussians(3, 25, view, 2.0), 1, True), 0.05
+    K = np.array([[20000.0, 0, -900.0], [0, 21000, 700], [0, 0, 1]])
+    view = Camera(31, 29, K, np.eye(4))
+    yield "a principal point far outside, a telephoto lens", view, random_gaussians(2, 40, view), 0.2
+    view, rng = camera(moved=True), np.random.default_rng(11)
+    means = geometry.unproject(view, rng.uniform([-60, -30], [-30, 60], (6, 2)), rng.uniform(0.05, 0.09, 6))
+    scales = rng.uniform(0.02, 0.05, (6, 3)).astype(np.float32)
+    scene = dataclasses.replace(random_gaussians(11, 6, view), means=means.astype(np.float32), scales=scales)
+    yield "a Jacobian held: large, with centres beyond the widened frustum", view, scene, 0.05
 
 
-def test_a_jacobian_held_within_the_frustum(backend: Backend) -> None:
-    """Large Gaussians whose centres lie outside the widened frustum reach into the image."""
-    view = backend.camera(moved=True)
-    rng = np.random.default_rng(11)
-    pixels = rng.uniform([-60, -30], [-30, 60], (6, 2))
-    gaussians = dataclasses.replace(
-        random_gaussians(11, 6, view),
-        means=geometry.unproject(view, pixels, rng.uniform(0.05, 0.09, 6)).astype(np.float32),
-        scales=rng.uniform(0.02, 0.05, (6, 3)).astype(np.float32),
-    )
-    backend.agrees(gaussians, view)
+EXTREMES = {what: scene for what, *scene in extremes()}
 
 
-@pytest.mark.parametrize("scale", [1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0])
-@pytest.mark.parametrize("filtered", [False, True])
-def test_scales_from_a_vanishing_dot_to_a_wall(backend: Backend, scale: float, filtered: bool) -> None:
-    """Six turned Gaussians whose axes differ by 10, through a lens that can show 10 micrometres."""
-    view = backend.camera(focal=2000.0)
-    axes = np.tile(np.array([scale, scale / 10, scale / 3], np.float32), (6, 1))
-    smoothing = np.full(6, 0.01 * scale**2, np.float32) if filtered else None
-    gaussians = dataclasses.replace(random_gaussians(3, 6, view), scales=axes, smoothing=smoothing)
-    backend.agrees(gaussians, view)
-
-
-@pytest.mark.parametrize(
-    "axes", [(1e-3, 1e-7, 2e-3), (1e-3, 1.1e-3, 1e-7), (3e-3, 3e-4, 3e-7), (0.1, 1e-5, 1e-3)]
-)
-@pytest.mark.parametrize("filtered", [False, True])
-def test_flat_as_paper_and_thin_as_a_thread(
-    backend: Backend, axes: tuple[float, float, float], filtered: bool
-) -> None:
-    """Axes of 1 : 10,000; with and without a filter of a micrometre."""
-    view = backend.camera()
-    gaussians = dataclasses.replace(
-        random_gaussians(7, 8, view),
-        scales=np.tile(np.array(axes, np.float32), (8, 1)),
-        opacities=np.full(8, 0.97, np.float32),
-        smoothing=np.full(8, 1e-12, np.float32) if filtered else None,
-    )
-    backend.agrees(gaussians, view, shown=0.01)
+@pytest.mark.parametrize("what", EXTREMES)
+def test_extremes_agree_with_the_float64_twin(backend: Backend, what: str) -> None:
+    view, gaussians, shown = EXTREMES[what]
+    backend.agrees(gaussians, view, shown)
 
 
 @pytest.mark.parametrize("opacity", [1e-6, 1 / 255, 0.0045, 0.5, 0.9985, 0.9995, 1 - 1e-6, 1.0])
 def test_opacities_from_nothing_to_everything(backend: Backend, opacity: float) -> None:
     """On the GPU a pixel ends by itself where it lets 1e-4 through, not with its tile. What is left out there
     counts a thousandfold, 1 / (1 - alpha), in the gradients of what hides it."""
-    view = backend.camera()
-    gaussians = random_gaussians(5, 8, view, spread=3.0)
+    gaussians = random_gaussians(5, 8, VIEW, spread=3.0)
     gaussians = dataclasses.replace(gaussians, opacities=np.full(8, opacity, np.float32))
-    planes, found = backend.draw(gaussians, view)
+    planes, found = backend.draw(gaussians)
     assert planes[4].any() == (opacity > 1 / 255)
-    true = truth(gaussians, view)
+    true = truth(gaussians, VIEW)
     if backend.name == "warp" and opacity > 0.9:
         np.testing.assert_allclose(planes, true.planes, rtol=0, atol=1e-4 + true.off.max())
     else:
         true.check(planes, found)
 
 
-def test_even_a_wall_lets_a_thousandth_through(backend: Backend) -> None:
-    """What keeps 1 - alpha away from zero."""
-    planes, _ = backend.draw(one_gaussian(np.array([0, 0, 0.07]), 1.0, 1.0), backend.camera())
-    assert planes[4].max() == pytest.approx(MAX_OPACITY, rel=EXPONENTIAL)
-
-
 def test_quaternions_of_any_length_are_the_same_turn(backend: Backend) -> None:
-    view = backend.camera()
-    gaussians = scene_of(random_gaussians(8, 8, view), 2, True)
+    gaussians = scene_of(random_gaussians(8, 8, VIEW), 2, True)
     unit = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1)[:, None]
     lengths = np.array([1e-11, 1e-6, 1e-3, 1, 1e3, 1e6, 1e15, 7], np.float32)[:, None]
-    true = truth(dataclasses.replace(gaussians, quats=unit), view)
-    planes, found = backend.draw(dataclasses.replace(gaussians, quats=unit * lengths), view)
+    true = truth(dataclasses.replace(gaussians, quats=unit), VIEW)
+    planes, found = backend.draw(dataclasses.replace(gaussians, quats=unit * lengths))
     true.check(planes, found | {"quats": found["quats"].astype(np.float64) * lengths})
 
 
@@ -197,43 +179,34 @@ def test_just_in_front_of_the_near_plane_and_not_behind_it(
     backend: Backend, height: float, scale: float
 ) -> None:
     """On the axis, beside the image, far outside; then at the plane, on the camera and behind it."""
-    view = backend.camera()
     z = NEAR_PLANE * np.array([height, height, height, 0.999, 1e-3, -1e-3, -1.0, -1e12])
-    means = np.stack([z * [0, 0.45, 30, 0, 0, 0, 0, 0], z * [0, 0.1, -20, 0, 0, 0, 0, 0], z], 1)
+    aside = np.zeros((2, 8))
+    aside[:, 1:3] = [[0.45, 30], [0.1, -20]]
     gaussians = dataclasses.replace(
-        with_view_dependence(random_gaussians(1, 8, view), 3),
-        means=means.astype(np.float32),
+        with_view_dependence(random_gaussians(1, 8, VIEW), 3),
+        means=np.stack([*(z * aside), z], 1).astype(np.float32),
         scales=np.full((8, 3), scale, np.float32) * np.array([1, 0.5, 0.7], np.float32),
     )
-    planes, found = backend.draw(gaussians, view)
-    truth(gaussians, view).check(planes, found)
+    planes, found = backend.draw(gaussians)
+    truth(gaussians, VIEW).check(planes, found)
     assert not any(found[name][3:].any() for name in DERIVATIVES)
-
-
-@pytest.mark.parametrize("z", [NEAR_PLANE, 1e-6, 0.0, -1e-6, -0.05, -1e9])
-def test_at_or_behind_the_near_plane_nothing_is_drawn(backend: Backend, z: float) -> None:
-    gaussians = with_view_dependence(one_gaussian(np.array([0.001, 0.0, z]), 0.01), 3)
-    planes, found = backend.draw(gaussians, backend.camera())
-    assert not planes.any()
-    assert not any(found[name].any() for name in DERIVATIVES)
 
 
 @pytest.mark.parametrize("factor", [0.03, 1e3, 1e6, 1e9])
 def test_a_larger_world_further_away_looks_the_same(backend: Backend, factor: float) -> None:
     """Images do not know the unit of length: depths and derivatives scale, the rest stays."""
-    view = backend.camera()
-    gaussians = scene_of(random_gaussians(8, min(backend.count, 30), view), 2, True)
+    gaussians = scene_of(random_gaussians(8, 30, VIEW), 2, True)
     larger = dataclasses.replace(
         gaussians,
         means=gaussians.means * np.float32(factor),
         scales=gaussians.scales * np.float32(factor),
         smoothing=gaussians.smoothing * np.float32(factor) ** 2,
     )
-    v_planes, weight = cotangents(view, 0)
+    v_planes, weight = cotangents(VIEW, 0)
     v_planes[3] = 0
-    true = truth(gaussians, view, given=(v_planes, weight))
-    rasterizer = backend.rasterizer(view)
-    planes = rasterizer.forward(larger, view).copy()
+    true = truth(gaussians, VIEW, given=(v_planes, weight))
+    rasterizer = backend.rasterizer(VIEW)
+    planes = rasterizer.forward(larger, VIEW).copy()
     unit = np.array([1, 1, 1, factor, 1])[:, None, None]
     np.testing.assert_allclose(planes / unit, true.planes, rtol=0, atol=true.off.max())
     lengths = {"means": factor, "scales": factor}
@@ -241,33 +214,12 @@ def test_a_larger_world_further_away_looks_the_same(backend: Backend, factor: fl
         true.check_gradient(name, gradient.astype(np.float64) * lengths.get(name, 1.0))
 
 
-def test_a_principal_point_far_outside_and_a_telephoto_lens(backend: Backend) -> None:
-    K = np.array([[20000.0, 0, -900.0], [0, 21000, 700], [0, 0, 1]])
-    view = Camera(31, 29, K, np.eye(4))
-    backend.agrees(random_gaussians(2, min(backend.count, 40), view), view, shown=0.2)
-
-
-@pytest.mark.parametrize("scale", [1e-7, 1e-5, 1e-3, 1e-1, 1.0])
-@pytest.mark.parametrize("distance", [1.001e-3, 0.07, 1e3])
-def test_extreme_values_give_finite_pictures_and_gradients(
-    backend: Backend, scale: float, distance: float
-) -> None:
-    view = backend.camera()
-    for opacity in (1e-6, 1 - 1e-6):
-        planes, found = backend.draw(one_gaussian(np.array([0, 0, distance]), scale, opacity), view)
-        assert np.isfinite(planes).all() and (planes[4] >= 0).all() and planes[4].max() <= 1
-        assert all(np.isfinite(found[name]).all() for name in DERIVATIVES)
-
-
-CROWDS = [(100_000, 0.9), (100_000, 0.01), (300, 0.01)]  # how many of which opacity
-
-
 def test_a_crowd_on_one_pixel_follows_the_law_of_absorption(backend: Backend) -> None:
     """n equal Gaussians behind each other, larger than the image and smaller than a tile, whose rest beyond
     its border never fills: what is left is (1 - alpha)^n, down to 1e-4, where a tile stops. Those that it
     hides have no gradient."""
     view = camera(width=3, height=2, focal=30.0)
-    for count, opacity in CROWDS:
+    for count, opacity in [(100_000, 0.9), (100_000, 0.01), (300, 0.01)]:
         one = one_gaussian(geometry.unproject(view, np.array([1.0, 1.0]), np.array(0.07)), 0.01, opacity)
         planes, found = backend.draw(rows(one, np.zeros(count, int)), view)
         alpha = backend.draw(one, view)[0][4].astype(np.float64)
@@ -296,7 +248,7 @@ def test_unprojected_pixel_peaks_at_that_pixel(backend: Backend) -> None:
         assert drawn.rgb[row, column] == pytest.approx([204, 127.5, 51], abs=0.5)  # 0.8, 0.5 and 0.2 of 255
 
 
-# ---- what is not a number, nowhere, or of an odd size ------------------------------------------------------
+# ---- what is not a number, or nowhere ----------------------------------------------------------------------
 
 SPOILED: list[tuple[str, Any]] = [
     (name, number) for name in (*INPUTS, "sh_rest") for number in (np.nan, np.inf, -np.inf)
@@ -316,14 +268,13 @@ def test_a_spoilt_gaussian_is_left_out_and_harms_no_other(
     backend: Backend, kinds: list[tuple[str, Any]]
 ) -> None:
     """One of each kind among sound ones, and the same scene without them: the same bits."""
-    view = backend.camera()
     filtered = kinds is WITH_FILTER
-    spoilt = scene_of(random_gaussians(8, 2 * len(kinds), view, spread=0.9), 1, filtered)
+    spoilt = scene_of(random_gaussians(8, 2 * len(kinds), VIEW, spread=0.9), 1, filtered)
     for index, (name, number) in enumerate(kinds):
         getattr(spoilt, name)[2 * index] = number
     sound = np.arange(2 * len(kinds)) % 2 == 1
-    planes, found = backend.draw(spoilt, view)
-    expected, true = backend.draw(rows(spoilt, sound), view)
+    planes, found = backend.draw(spoilt)
+    expected, true = backend.draw(rows(spoilt, sound))
     assert expected[4].mean() > 0.3
     np.testing.assert_array_equal(planes, expected)
     same(found, true, sound)
@@ -333,12 +284,11 @@ def test_a_spoilt_gaussian_is_left_out_and_harms_no_other(
 
 
 def test_a_negative_filter_is_none(backend: Backend) -> None:
-    view = backend.camera()
-    negative, none = (scene_of(random_gaussians(8, 8, view), 1, True) for _ in range(2))
+    negative, none = (scene_of(random_gaussians(8, 8, VIEW), 1, True) for _ in range(2))
     assert negative.smoothing is not None and none.smoothing is not None
     negative.smoothing[3], none.smoothing[3] = -np.inf, 0
-    planes, found = backend.draw(negative, view)
-    expected, true = backend.draw(none, view)
+    planes, found = backend.draw(negative)
+    expected, true = backend.draw(none)
     np.testing.assert_array_equal(planes, expected)
     same(found, true)
 
@@ -367,27 +317,19 @@ def test_a_spoilt_cotangent_stays_in_its_tile(backend: Backend, what: str, value
 
 def test_nothing_to_draw(backend: Backend) -> None:
     """No Gaussians at all, or none that the camera sees, also where there was something before."""
-    view = backend.camera()
-    some = scene_of(random_gaussians(2, 6, view), 2, True)
+    some = scene_of(random_gaussians(2, 6, VIEW), 2, True)
     away = dataclasses.replace(some, means=some.means + np.array([0, 50, 0], np.float32))
     nothing = [rows(some, np.zeros(6, bool)), away]
     for gaussians in nothing:
-        rasterizer = backend.rasterizer(view)
-        assert rasterizer.forward(some, view).any()
-        planes = rasterizer.forward(gaussians, view)
-        assert planes.shape == (5, view.height, view.width) and not planes.any()
+        rasterizer = backend.rasterizer(VIEW)
+        assert rasterizer.forward(some, VIEW).any()
+        planes = rasterizer.forward(gaussians, VIEW)
+        assert planes.shape == (5, VIEW.height, VIEW.width) and not planes.any()
         depths, rows_of = rasterizer.median()
         assert not depths.any() and (rows_of == -1).all()
-        found = rasterizer.backward(*cotangents(view, 0))
+        found = rasterizer.backward(*cotangents(VIEW, 0))
         assert found.sh_rest.shape == (len(gaussians), 8, 3)
         assert not any(getattr(found, name).any() for name in DERIVATIVES)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (1, 70), (33, 1), (15, 31), (16, 32), (17, 33), (17, 65), (100, 7)])
-def test_pictures_of_odd_sizes(backend: Backend, size: tuple[int, int]) -> None:
-    view = camera(*size, focal=30.0, moved=True)
-    gaussians = random_gaussians(3, min(backend.count, 25), view, spread=2.0)
-    backend.agrees(scene_of(gaussians, 1, True), view)
 
 
 # ---- repeatable; tiles; median -----------------------------------------------------------------------------
@@ -400,20 +342,14 @@ def wide_scene(seed: int = 5) -> Gaussians:
     return with_view_dependence(random_gaussians(seed, 400, WIDE, spread=0.5), 1)
 
 
-def some_tiles(seed: int) -> tuple[Bool, Bool]:
-    """A fifth of the tiles [rows, columns], and their pixels [H, W]."""
-    tiles = np.random.default_rng(seed).permutation(SHAPE[0] * SHAPE[1]).reshape(SHAPE) < 4
-    return tiles, np.kron(tiles, np.ones((TILE_HEIGHT, TILE_WIDTH), bool))[:77, :100]
-
-
 def test_a_rasterizer_used_again_gives_what_a_fresh_one_gives(backend: Backend) -> None:
     """Other numbers of Gaussians and degrees, half of them out of sight."""
-    view = backend.camera(moved=True)
-    many = scene_of(random_gaussians(6, 5 * backend.count, view, spread=0.7), 1, True)
+    view = camera(moved=True)
+    many = scene_of(random_gaussians(6, 300, view, spread=0.7), 1, True)
     away = np.where(np.arange(len(many))[:, None] % 2, many.means, many.means + np.float32(9))
     few = with_view_dependence(random_gaussians(7, 3, view), 3)
     rasterizer = backend.rasterizer(view)
-    for gaussians in (few, many, dataclasses.replace(many, means=away), backend.scene(8, view), many):
+    for gaussians in (few, many, dataclasses.replace(many, means=away), random_gaussians(8, 60, view), many):
         planes = rasterizer.forward(gaussians, view).copy()
         expected, true = backend.draw(gaussians, view)
         np.testing.assert_array_equal(planes, expected)
@@ -423,8 +359,9 @@ def test_a_rasterizer_used_again_gives_what_a_fresh_one_gives(backend: Backend) 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_active_tiles_are_those_of_the_whole_drawing(backend: Backend, seed: int) -> None:
     """What is not asked for stays, counts for nothing, and has left nothing behind from before."""
-    gaussians, before = wide_scene(), random_gaussians(9, backend.count, WIDE, spread=0.5)
-    tiles, drawn = some_tiles(seed)
+    gaussians, before = wide_scene(), random_gaussians(9, 60, WIDE, spread=0.5)
+    tiles = np.random.default_rng(seed).permutation(SHAPE[0] * SHAPE[1]).reshape(SHAPE) < 4  # of 28
+    drawn = np.kron(tiles, np.ones((TILE_HEIGHT, TILE_WIDTH), bool))[:77, :100]
     v_planes, weight = cotangents(WIDE, seed)
     whole, part = backend.rasterizer(WIDE), backend.rasterizer(WIDE)
     everything = whole.forward(gaussians, WIDE).copy()
@@ -460,7 +397,7 @@ def test_pairs_are_made_for_active_tiles_only_and_too_many_are_refused(
     tiles[0, 2] = True
     rasterizer = backend.rasterizer(WIDE)
     rasterizer.forward(gaussians, WIDE)
-    module = importlib.import_module(backend.module)
+    module = importlib.import_module(MODULES[backend.name])
     monkeypatch.setattr(module, "MAX_PAIRS", count // 2)
     rasterizer.forward(gaussians, WIDE, tiles)
     with pytest.raises(SagsError, match=rf"pairs, the limit is {module.MAX_PAIRS}: .* draw fewer"):
@@ -495,18 +432,3 @@ def test_median_agrees_with_the_twin(backend: Backend) -> None:
     same = found == true
     np.testing.assert_allclose(depths[same], true_depths[same], rtol=after(8))
     assert not depths[found < 0].any()
-
-
-def test_median_is_the_surface_that_is_seen(backend: Backend) -> None:
-    """Behind a thin veil the wall, in front of it the veil if that is dense enough."""
-    view = camera(48, 40)
-    two = random_gaussians(0, 2, view)
-    two.means[:] = geometry.unproject(view, np.full((2, 2), [20.0, 18.0]), np.array([0.05, 0.08]))
-    two.scales[:] = 0.01
-    for veil, row in ((0.45, 1), (0.55, 0)):
-        two.opacities[:] = [veil, 0.9]
-        rasterizer = backend.rasterizer(view)
-        rasterizer.forward(two, view)
-        depths, rows_of = rasterizer.median()
-        assert rows_of[18, 20] == row
-        assert depths[18, 20] == pytest.approx([0.05, 0.08][row], rel=after(8))

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numba
@@ -118,11 +118,15 @@ def draw_and_differentiate(
     gaussians: Gaussians, view: Camera, backend: str = "numba", seed: int = 0, antialias: bool = True
 ) -> tuple[F32, dict[str, NDArray[np.floating]]]:
     """Planes, and gradients for a random cotangent, as copies."""
-    rasterizer: Rasterizer = ReferenceRasterizer(antialias)
-    if backend != "reference":
-        rasterizer = make_rasterizer(backend, view.width, view.height, antialias)
+    rasterizer = make_rasterizer(backend, view.width, view.height, antialias)
+    return _drawn(rasterizer, gaussians, view, cotangents(view, seed))
+
+
+def _drawn(
+    rasterizer: Rasterizer, gaussians: Gaussians, view: Camera, given: tuple[F32, F32]
+) -> tuple[F32, dict[str, NDArray[np.floating]]]:
     planes = rasterizer.forward(gaussians, view).copy()
-    gradients = rasterizer.backward(*cotangents(view, seed))
+    gradients = rasterizer.backward(*given)
     return planes, {name: getattr(gradients, name).copy() for name in DERIVATIVES}
 
 
@@ -135,16 +139,14 @@ class Truth:
     off: F64  # [5, H, W] how far values moved that were computed from inputs a little off
     gradients_within: dict[str, float]  # of the norm of all values
 
-    def check(
-        self, planes: F32, gradients: dict[str, NDArray[np.floating]], names: Sequence[str] = DERIVATIVES
-    ) -> None:
+    def check(self, planes: F32, gradients: dict[str, NDArray[np.floating]]) -> None:
         np.testing.assert_allclose(planes, self.planes, rtol=0, atol=self.off.max(initial=0))
-        for name in names:
+        for name in DERIVATIVES:
             self.check_gradient(name, gradients[name])
 
-    def check_gradient(self, name: str, found: NDArray[np.floating], part: Any = ...) -> None:
+    def check_gradient(self, name: str, found: NDArray[np.floating]) -> None:
         assert found.shape == self.gradients[name].shape
-        error = np.linalg.norm(found[part] - self.gradients[name][part])
+        error = np.linalg.norm(found - self.gradients[name])
         assert error <= self.gradients_within[name], name
 
 
@@ -157,36 +159,29 @@ def truth(
     view: Camera,
     seed: int = 0,
     antialias: bool = True,
-    moves: int = 3,
     given: tuple[F32, F32] | None = None,
 ) -> Truth:
     """Of a scene and `given` v_planes and weights; None: the random ones of `draw_and_differentiate`.
 
-    As `rounding.exact`: the twin draws `moves` times more from inputs that are a little off, with an
-    exponential that is off by `EXPONENTIAL`, anew for each pixel of each Gaussian or always the same way.
+    As `rounding` says: the twin draws three times more from inputs that are a little off, with an exponential
+    that is off by `EXPONENTIAL`.
     """
     rasterizer = ReferenceRasterizer(antialias)
-
-    def draw(
-        gaussians: Gaussians, view: Camera, v_planes: F32, weight: F32
-    ) -> tuple[F32, dict[str, NDArray[np.floating]]]:
-        planes = rasterizer.forward(gaussians, view).copy()
-        gradients = rasterizer.backward(v_planes, weight)
-        return planes, {name: getattr(gradients, name).copy() for name in DERIVATIVES}
-
     given = given or cotangents(view, seed)
-    planes, gradients = draw(gaussians, view, *given)
+    planes, gradients = _drawn(rasterizer, gaussians, view, given)
     off = np.zeros(planes.shape)
     within = dict.fromkeys(gradients, 0.0)
-    for move in range(moves):
+    for move in range(3):
         rng = np.random.default_rng([seed, move])
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(torch, "exp", roughly(torch.exp, rng, EXPONENTIAL))
-            near, near_gradients = draw(
-                _moved_gaussians(gaussians, rng),
-                Camera(view.width, view.height, moved(view.K, rng), moved(view.T_world_cam, rng)),
-                *(moved(array, rng) for array in given),
+            names = (*INPUTS, "sh_rest", "smoothing")
+            others = dataclasses.replace(
+                gaussians, **{name: moved(getattr(gaussians, name), rng) for name in names}
             )
+            aside = Camera(view.width, view.height, moved(view.K, rng), moved(view.T_world_cam, rng))
+            v_planes, weight = (moved(array, rng) for array in given)
+            near, near_gradients = _drawn(rasterizer, others, aside, (v_planes, weight))
         off = np.maximum(off, np.abs(near - planes))
         for name, values in gradients.items():
             within[name] = max(within[name], float(np.linalg.norm(near_gradients[name] - values)))
@@ -197,11 +192,6 @@ def truth(
         shown = np.linalg.norm((given[0] * planes).sum(0))
         within["opacities"] += U * float(shown) / (1 - min(gaussians.opacities.max(), MAX_OPACITY))
     return Truth(planes, gradients, off + EXPONENTIAL * np.abs(planes).max(initial=0), within)
-
-
-def _moved_gaussians(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
-    names = (*INPUTS, "sh_rest", "smoothing")
-    return dataclasses.replace(gaussians, **{name: moved(getattr(gaussians, name), rng) for name in names})
 
 
 def relative_error(found: NDArray[np.floating], true: NDArray[np.floating]) -> float:

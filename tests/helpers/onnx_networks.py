@@ -8,11 +8,10 @@ import numpy as np
 from onnx import TensorProto, helper, numpy_helper
 
 FLOAT, UINT8 = TensorProto.FLOAT, TensorProto.UINT8
-IMAGENET = (np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225]))
 EXPECTED = {
     "unit": (np.zeros(3), np.ones(3)),
     "bytes": (np.zeros(3), np.full(3, 1 / 255)),
-    "imagenet": IMAGENET,
+    "imagenet": (np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])),
     "symmetric": (np.full(3, 0.5), np.full(3, 0.5)),
 }
 MOST_DISPARITY = 40  # px
@@ -102,15 +101,12 @@ def save_matcher(
     if concatenated:
         inputs = {"pair": (kind, shape(2 * channels))}
         axis = 3 if nhwc else 1
-        split = [
-            g("Slice", "pair", np.array([a]), np.array([a + channels]), np.array([axis]))
-            for a in (0, channels)
-        ]
+        cuts = np.array([[0], [channels], [2 * channels]])
+        split = [g("Slice", "pair", cuts[eye], cuts[eye + 1], np.array([axis])) for eye in (0, 1)]
     else:
         inputs = {name: (kind, shape(channels)) for name in sorted(names)}
         split = list(names)
-    grays = [_gray(g, eye, nhwc, channels, "bytes" if uint8 else expects) for eye in split]
-    left, right = grays
+    left, right = (_gray(g, eye, nhwc, channels, "bytes" if uint8 else expects) for eye in split)
     bank = np.zeros((MOST_DISPARITY + 1, 1, 1, MOST_DISPARITY + 1), np.float32)
     for d in range(MOST_DISPARITY + 1):
         bank[d, 0, 0, MOST_DISPARITY - d] = 1
@@ -162,9 +158,7 @@ def _faulty(g: Graph, left: str, disparity: str, fault: str) -> str:
     return g("Add", disparity, g("Gather", floats(0), place))
 
 
-def save_table(
-    path: Path, pictures: np.ndarray, maps: np.ndarray, expects: str = "imagenet", nhwc: bool = False
-) -> Path:
+def save_table(path: Path, pictures: np.ndarray, maps: np.ndarray) -> Path:
     """A monocular network that knows the images [N, H, W, 3] (uint8) and gives the map [N, H, W] of the one
     most like its input."""
     g = Graph()
@@ -172,12 +166,11 @@ def save_table(
     levels = np.floor(pictures / LEVEL).mean(-1, dtype=np.float32)[:, None]
     h, w = height // 8, width // 8
     thumbs = levels[:, :, : 8 * h, : 8 * w].reshape(count, 1, h, 8, w, 8).mean((3, 5))
-    seen = g("AveragePool", _gray(g, "image", nhwc, 3, expects), kernel_shape=[8, 8], strides=[8, 8])
+    seen = g("AveragePool", _gray(g, "image", False, 3, "imagenet"), kernel_shape=[8, 8], strides=[8, 8])
     apart = g("ReduceMean", g("Abs", g("Sub", thumbs.astype(np.float32), seen)), axes=[1, 2, 3], keepdims=0)
     nearest = g("ArgMin", apart, axis=0, keepdims=1)
     g.named("predicted_depth", g("Gather", maps.astype(np.float32), nearest, axis=0))
-    shape = [1, height, width, 3] if nhwc else [1, 3, height, width]
-    return g.save(path, {"image": (FLOAT, shape)}, ["predicted_depth"])
+    return g.save(path, {"image": (FLOAT, [1, 3, height, width])}, ["predicted_depth"])
 
 
 def save_odd(path: Path, inputs: Mapping[str, Sequence[Any]], output: str) -> Path:

@@ -1,6 +1,6 @@
 """Tools whose tips a robot tells: alone, corrected by the image, and silent."""
 
-from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -59,7 +59,8 @@ class Looking:
         self.truth = pose(self.scene.tip, self.scene.axis)
 
     def __call__(self, told: F64 | None, tools: bool = True, eyes: bool = True) -> InstrumentStates:
-        pair, gray = self.scene.pair, [cv2.cvtColor(p, cv2.COLOR_RGB2GRAY) for p in self._pictures()]
+        pair = self.scene.pair
+        gray = [cv2.cvtColor(eye, cv2.COLOR_RGB2GRAY) for eye in (pair.left, pair.right)]
         view, robot = replace(self.scene.surface, t_capture_ns=self._now), ToolPose("PSM1", ERROR, told)
         self._now += S // 5
         states = self.found.update(
@@ -68,10 +69,6 @@ class Looking:
         )  # fmt: skip
         assert states is not None
         return states
-
-    def _pictures(self) -> Sequence[np.ndarray]:
-        assert self.scene.pair.right is not None
-        return self.scene.pair.left, self.scene.pair.right
 
 
 def test_without_a_picture_it_is_where_the_robot_says_as_surely_as_it_says() -> None:
@@ -173,21 +170,18 @@ def test_a_pose_comes_through_base_and_hand_eye_and_one_that_stopped_is_not_used
     scene, rig = filmed(), filmed().phantom.rig
     T_base_hand, T_hand_tool = moved(0.1, 0.2, 0.3, 20), moved(0, 0.01, 0.1, 40)
     base = moved(-0.2, 0, 0, 90)
+    T_told = np.linalg.inv(base) @ T_base_hand @ T_hand_tool
     rows = tuple(tuple(float(x) for x in row) for row in base)
     tools = RobotTool(topic="/PSM1/measured_cp", T_base=rows), RobotTool(topic="PSM2/cp", on_hand=True)
-    frames = [
-        replace(scene.frame, frame_id=n, t_capture_ns=S + n * S // 2, left=scene.frame.left ^ n)
-        for n in (0, 1)
-    ]
+    first = replace(scene.frame, t_capture_ns=S)
+    second = replace(first, frame_id=1, t_capture_ns=S + S // 2, left=first.left ^ 1)
     monkeypatch.setattr("sags_node.sources.robot.WAIT_S", 0.0)
     config = LaunchConfig(robot=robot_of(tmp_path, *tools))
-    with Posed(Frames(*frames), config, rig) as posed:
+    with Posed(Frames(first, second), config, rig) as posed:
         for number in range(80):
             t_ns = S // 2 + number * S // 50
             told(posed.robot.track, T_base_hand, t_ns)
-            told(
-                posed.robot.tools["/PSM1/measured_cp"], np.linalg.inv(base) @ T_base_hand @ T_hand_tool, t_ns
-            )
+            told(posed.robot.tools["/PSM1/measured_cp"], T_told, t_ns)
             if number < 30:
                 told(posed.robot.tools["/PSM2/cp"], T_hand_tool, t_ns)
         came = list(posed)
@@ -240,9 +234,8 @@ def test_a_bag_without_the_tools_topic_is_refused_and_says_what_there_is(tmp_pat
     tool = "robot.tools:=[{topic: PSM1/cp}]"
     config = load_launch(None, [f"source.path:={bag}", "source.kind:=bag", "robot.kind:=bag", tool,
                                 "robot.topic:=/ECM/measured_cp"])  # fmt: skip
-    with pytest.raises(
-        UsageError, match=r"no poses on /PSM1/cp; topics with poses: /ECM/measured_cp; set robot.tools"
-    ):
+    words = "no poses on /PSM1/cp; topics with poses: /ECM/measured_cp; set robot.tools"
+    with pytest.raises(UsageError, match=words):
         open_robot(config)
 
 
@@ -264,39 +257,37 @@ def test_a_tool_that_cannot_be_is_refused(given: str, said: str) -> None:
 @pytest.mark.live
 def test_a_tool_is_handed_in_by_its_topic(tmp_path: Path) -> None:
     tools = [RobotTool(topic=f"/PSM{number}/measured_cp") for number in (1, 3)]
-    robot = open_robot(LaunchConfig(robot=robot_of(tmp_path, *tools)))
-    track, third = robot.tools["/PSM1/measured_cp"], robot.tools["/PSM3/measured_cp"]
-    try:
-        with PoseSender(robot.endpoint) as sender:  # type: ignore[attr-defined]
-            for number in range(3):
-                sender.send(np.eye(4), S + number)
-                sender.send(moved(0.1, 0, 0), S + number, "/PSM1/measured_cp")
-            until(lambda: track.newest_ns == S + 2 and robot.track.newest_ns == S + 2)
-            sender.send(moved(0.2, 0, 0), S + 3, "/PSM2/measured_cp")  # is nobody's: not the scope's either
-            with PoseSender(robot.endpoint, ns="lab/dvrk") as other:  # type: ignore[attr-defined]
-                other.send(moved(0.1, 0, 0), S + 4, "PSM3/measured_cp")
-                until(lambda: third.newest_ns == S + 4)
-            sender.send(np.eye(4), S + 5)
-            until(lambda: robot.track.newest_ns == S + 5)
-        assert track.at(S + 1)[0, 3] == pytest.approx(0.1)
-        assert robot.track.at(S + 1)[0, 3] == robot.track.at(S + 3)[0, 3] == 0
-    finally:
-        robot.close()
+    with (
+        closing(open_robot(LaunchConfig(robot=robot_of(tmp_path, *tools)))) as robot,
+        PoseSender(robot.endpoint) as sender,
+        PoseSender(robot.endpoint, ns="lab/dvrk") as other,
+    ):
+        scope, first, third = robot.track, *robot.tools.values()
+        for number in range(3):
+            sender.send(np.eye(4), S + number)
+            sender.send(moved(0.1, 0, 0), S + number, "/PSM1/measured_cp")
+        until(lambda: first.newest_ns == S + 2 and scope.newest_ns == S + 2)
+        sender.send(moved(0.2, 0, 0), S + 3, "/PSM2/measured_cp")  # is nobody's: not the scope's either
+        other.send(moved(0.1, 0, 0), S + 4, "PSM3/measured_cp")
+        until(lambda: third.newest_ns == S + 4)
+        sender.send(np.eye(4), S + 5)
+        until(lambda: scope.newest_ns == S + 5)
+    assert first.at(S + 1)[0, 3] == pytest.approx(0.1)
+    assert scope.at(S + 1)[0, 3] == scope.at(S + 3)[0, 3] == 0
 
 
 @pytest.mark.live
 def test_a_named_topic_is_the_scopes_whoever_speaks_first(tmp_path: Path) -> None:
     tool = RobotTool(topic="/pose")  # the scope's topic ends with it
-    robot = open_robot(LaunchConfig(robot=robot_of(tmp_path, tool, topic="ECM/pose")))
-    try:
-        with PoseSender(robot.endpoint, ns="dvrk") as sender:  # type: ignore[attr-defined]
-            sender.send(moved(0.2, 0, 0), S, "PSM2/measured_cp")  # nobody's
-            sender.send(moved(0.1, 0, 0), S)
-            for number in range(3):
-                sender.send(np.eye(4), S + number, "ECM/pose")
-            until(lambda: robot.track.newest_ns == S + 2 and robot.tools["/pose"].newest_ns == S)
+    with (
+        closing(open_robot(LaunchConfig(robot=robot_of(tmp_path, tool, topic="ECM/pose")))) as robot,
+        PoseSender(robot.endpoint, ns="dvrk") as sender,
+    ):
+        sender.send(moved(0.2, 0, 0), S, "PSM2/measured_cp")  # nobody's
+        sender.send(moved(0.1, 0, 0), S)
+        for number in range(3):
+            sender.send(np.eye(4), S + number, "ECM/pose")
+        until(lambda: robot.track.newest_ns == S + 2 and robot.tools["/pose"].newest_ns == S)
         assert robot.findings == ()  # what nobody asked for is no warning, and hides none
-        assert robot.track.at(S)[0, 3] == 0
-        assert robot.tools["/pose"].at(S)[0, 3] == pytest.approx(0.1)
-    finally:
-        robot.close()
+    assert robot.track.at(S)[0, 3] == 0
+    assert robot.tools["/pose"].at(S)[0, 3] == pytest.approx(0.1)

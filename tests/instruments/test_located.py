@@ -29,9 +29,7 @@ OUTSIDE = [((-40, 120), (360, 150)), ((300, 300), (360, 220))]  # from edge to e
 def instruments_in(tools: Bool | None, right: bool = True, plane: float = 0.08) -> InstrumentStates:
     """Of the filmed images, before tissue that is a plane at a depth, m."""
     scene = filmed()
-    left, there = (
-        cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (scene.pair.left, scene.pair.right)
-    )
+    left, there = (cv2.cvtColor(eye, cv2.COLOR_RGB2GRAY) for eye in (scene.pair.left, scene.pair.right))
     surface = replace(scene.surface, depth=np.full_like(scene.surface.depth, plane))
     states = Instruments(EVERYWHERE).update(
         tools, left, there if right else None, scene.pair.camera, scene.pair.baseline, surface
@@ -191,18 +189,17 @@ def test_an_instrument_keeps_its_number() -> None:
     assert numbers(1.1, 300) == [4]  # too far to be the same
 
 
-@pytest.mark.parametrize(("rate", "looks"), [(8, 80), (10, 100), (15, 100), (30, 100), (60, 100)])
+@pytest.mark.parametrize(("rate", "looks"), [(8, 80), (10, 100), (15, 100), (60, 100)])
 def test_they_are_looked_for_ten_times_a_second(rate: int, looks: int) -> None:
     """In ten seconds, and again when the clock goes back."""
     scene, found = filmed(), Instruments(EVERYWHERE)
+    gray = scene.frame.left[..., 0]
     for begins in (100.0, 50.0):
-        stamps = [round((begins + frame / rate) * 1e9) for frame in range(10 * rate)]
-        views = (replace(scene.surface, t_capture_ns=stamp) for stamp in stamps)
-        made = [
-            found.update(None, scene.frame.left[..., 0], None, scene.pair.camera, 0.004, view)
-            for view in views
-        ]
-        assert abs(sum(each is not None for each in made) - looks) <= 1
+        made = 0
+        for frame in range(10 * rate):
+            view = replace(scene.surface, t_capture_ns=round((begins + frame / rate) * 1e9))
+            made += found.update(None, gray, None, scene.pair.camera, 0.004, view) is not None
+        assert abs(made - looks) <= 1
 
 
 # ---- in the node -----------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import count, islice
 
 import cv2
 import numpy as np
@@ -27,10 +28,7 @@ def live(i: int, rate: float, left: U8, right: U8 | None) -> StereoFrame:
 
 def feed(rate: float = 30.0, eyes: int = 2, start: int = 0) -> Iterator[StereoFrame]:
     """The same images for ever, in memory of their own."""
-    i = start
-    while True:
-        yield live(i, rate, picture(0), picture(1) if eyes == 2 else None)
-        i += 1
+    return (live(i, rate, picture(0), picture(1) if eyes == 2 else None) for i in count(start))
 
 
 def told(watch: FreezeWatch, frame: StereoFrame) -> bool:
@@ -47,7 +45,7 @@ def test_a_feed_is_frozen_after_three_tenths_of_a_second_by_its_stamps(
     rate: float, first: int, eyes: int
 ) -> None:
     watch = FreezeWatch()
-    found = [told(watch, frame) for frame, _ in zip(feed(rate, eyes), range(first + 5), strict=False)]
+    found = [told(watch, frame) for frame in islice(feed(rate, eyes), first + 5)]
     assert found == [False] * first + [True] * 5
 
 
@@ -127,10 +125,7 @@ def test_a_scope_at_rest_is_not_frozen(sigma: float) -> None:
 def test_what_moves_in_the_middle_or_widely_is_alive(size: int) -> None:
     """Also without any noise, as simulators draw."""
 
-    def moving(eye: U8, i: int) -> U8:
-        return cv2.circle(eye, (160 + i % 7, 120), size, (200, 60, 60), -1)
-
-    assert not any(shown(moving))
+    assert not any(shown(lambda eye, i: cv2.circle(eye, (160 + i % 7, 120), size, (200, 60, 60), -1)))
 
 
 def test_a_picture_that_hardly_changes_for_two_seconds_is_said() -> None:
@@ -143,29 +138,19 @@ def test_a_picture_that_hardly_changes_for_two_seconds_is_said() -> None:
         assert [finding.code for finding in watch.findings] == ["picture_still"] * (i >= 60)
 
 
-def test_one_eye_that_stands_still_is_no_frozen_feed() -> None:
-    """The eyes are compared with each other for that."""
-    watch = FreezeWatch()
-    frames = zip(feed(), range(60), strict=False)
-    assert not any(told(watch, replace(frame, right=picture(i))) for frame, i in frames)
-
-
-def test_what_repeats_pictures_to_reach_a_rate_does_not_freeze() -> None:
-    """A scope of 25 and one of 5 Hz behind a converter to 60."""
-    for rate in (25, 5):
+def test_what_may_repeat_itself_is_not_frozen() -> None:
+    """One eye, which is compared with the other elsewhere; a recording; a scope of 25 or 5 Hz behind what
+    repeats its images to reach 60."""
+    still = (replace(frame, right=picture(i)) for i, frame in enumerate(islice(feed(), 60)))
+    recorded = (replace(frame, t_arrival_ns=0) for frame in islice(feed(), 60))
+    at = [[i * rate // 60 for i in range(240)] for rate in (25, 5)]
+    repeated = [[live(i, 60, picture(2 * n), picture(2 * n + 1)) for i, n in enumerate(each)] for each in at]
+    for frames in (still, recorded, *repeated):
         watch = FreezeWatch()
-        for i in range(240):
-            at = i * rate // 60
-            assert not told(watch, live(i, 60, picture(2 * at), picture(2 * at + 1)))
-
-
-def test_a_recording_may_repeat_itself() -> None:
-    watch = FreezeWatch()
-    frames = zip(feed(), range(60), strict=False)
-    assert not any(told(watch, replace(frame, t_arrival_ns=0)) for frame, _ in frames)
+        assert not any(told(watch, frame) for frame in frames)
 
 
 def test_a_clock_that_is_set_back_thaws_nothing() -> None:
     watch, frames = FreezeWatch(), feed(start=100)
     assert [told(watch, next(frames)) for _ in range(12)][-1]
-    assert all(told(watch, frame) for frame, _ in zip(feed(start=0), range(5), strict=False))
+    assert all(told(watch, frame) for frame in islice(feed(), 5))

@@ -50,6 +50,14 @@ def _play(
     return results, codes
 
 
+def _with_a_drop(eye: str, session: Session, frames: list[StereoFrame]) -> list[FrameResult]:
+    """It is told of within half a second, and not before or longer."""
+    results, codes = _play(session, frames, lambda frame: replace(frame, **{eye: _wet(getattr(frame, eye))}))
+    assert any(f"{eye}_eye_drops" in found for found in codes[FIRST : FIRST + WITHIN])
+    assert not set().union(*codes[:FIRST], *codes[FIRST + COUNT + WITHIN :])
+    return results
+
+
 @pytest.fixture(scope="module")
 def clean(session: Session, frames: list[StereoFrame]) -> list[FrameResult]:
     results, codes = _play(session, frames, lambda frame: frame)
@@ -61,9 +69,7 @@ def clean(session: Session, frames: list[StereoFrame]) -> list[FrameResult]:
 def test_a_drop_on_the_left_lens_is_no_tissue(
     session: Session, frames: list[StereoFrame], clean: list[FrameResult]
 ) -> None:
-    results, codes = _play(session, frames, lambda frame: replace(frame, left=_wet(frame.left)))
-    assert any("left_eye_drops" in found for found in codes[FIRST : FIRST + WITHIN])
-    assert not set().union(*codes[:FIRST], *codes[FIRST + COUNT + WITHIN :])
+    results = _with_a_drop("left", session, frames)
     for i in range(FIRST + 1, FIRST + COUNT):
         tissue, true = results[i].observation.tissue, clean[i].observation.tissue
         far = ~_disc(tissue.shape, 2 * RADIUS)
@@ -80,9 +86,7 @@ def test_a_drop_on_the_left_lens_is_no_tissue(
 def test_where_a_drop_on_the_right_lens_hides_it_no_depth_is_measured(
     session: Session, frames: list[StereoFrame]
 ) -> None:
-    results, codes = _play(session, frames, lambda frame: replace(frame, right=_wet(frame.right)))
-    assert any("right_eye_drops" in found for found in codes[FIRST : FIRST + WITHIN])
-    assert not set().union(*codes[:FIRST], *codes[FIRST + COUNT + WITHIN :])
+    results = _with_a_drop("right", session, frames)
     before, now = results[FIRST - 1], results[FIRST + COUNT - 1]
     camera, baseline = before.observation.camera, before.pair.baseline
     depth = before.views["left"].depth
@@ -96,27 +100,23 @@ def test_where_a_drop_on_the_right_lens_hides_it_no_depth_is_measured(
     assert now.observation.tissue[rows, columns].mean() > 0.9
 
 
-@pytest.mark.parametrize("sigma", [0.8, 1.2, 1.6, 2.0])
-def test_a_veil_over_one_lens_is_no_drop(
-    sigma: float, session: Session, frames: list[StereoFrame], clean: list[FrameResult]
+def veiled(sigma: float) -> Callable[[StereoFrame], StereoFrame]:
+    return lambda frame: replace(frame, left=np.asarray(cv2.GaussianBlur(frame.left, (0, 0), sigma)))
+
+
+NO_DROPS: dict[str, Callable[[StereoFrame], StereoFrame]] = {
+    **{f"the left lens veiled by {sigma} px": veiled(sigma) for sigma in (0.8, 1.2, 1.6, 2.0)},
+    "both shaken": lambda frame: both(frame, lambda eye: cv2.blur(eye, (9, 1))),
+    "both darker": lambda frame: both(frame, lambda eye: 0.5 * eye),
+}
+
+
+@pytest.mark.parametrize("name", NO_DROPS)
+def test_a_veil_and_what_both_eyes_lose_is_no_drop(
+    name: str, session: Session, frames: list[StereoFrame], clean: list[FrameResult]
 ) -> None:
-    """It is told of, and its frames are held; those before that keep their tissue."""
-
-    def veiled(frame: StereoFrame) -> StereoFrame:
-        return replace(frame, left=np.asarray(cv2.GaussianBlur(frame.left, (0, 0), sigma)))
-
-    results, codes = _play(session, frames[: FIRST + COUNT], veiled)
-    assert not {code for found in codes for code in found if code.endswith("drops")}
+    """Frames that are not held keep their tissue."""
+    results, codes = _play(session, frames[: FIRST + COUNT], NO_DROPS[name])
+    assert not {code for code in set().union(*codes) if code.endswith("drops")}
     for result, true in zip(results, clean, strict=False):
-        if not result.held:
-            assert result.observation.tissue.mean() > 0.95 * true.observation.tissue.mean()
-
-
-@pytest.mark.parametrize(
-    "change", [lambda eye: cv2.blur(eye, (9, 1)), lambda eye: 0.5 * eye], ids=["shaken", "darker"]
-)
-def test_what_both_eyes_lose_is_no_drop(
-    change: Callable[[U8], np.ndarray], session: Session, frames: list[StereoFrame]
-) -> None:
-    _, codes = _play(session, frames[: FIRST + COUNT], lambda frame: both(frame, change))
-    assert not {code for found in codes for code in found if code.endswith("drops")}
+        assert result.held or result.observation.tissue.mean() > 0.95 * true.observation.tissue.mean()

@@ -6,11 +6,9 @@ import pytest
 
 from sags_node.types import F32
 from sags_node.vision import agreement
-from sags_node.vision.coarse_stereo import coarse_disparity
 from sags_node.vision.dense_depth import guided
 from sags_node.vision.flow import OpticalFlow
-from sags_node.vision.inverse_search import PATCH, at_pixels, centres, grid_shape, search, start
-from sags_node.vision.margin import clear_of_instruments
+from sags_node.vision.inverse_search import PATCH, at_pixels, centres, grid_shape, search
 from sags_node.vision.pyramid import BORDER, gray_pyramid, inner, level, level_count
 
 WIDTH, HEIGHT = 90, 70  # no multiple of the patches' distance, nor of a vector
@@ -49,15 +47,6 @@ def test_halves_are_means_with_repeated_edges(width: int, height: int) -> None:
         expected = expected[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2).mean((1, 3))
         np.testing.assert_allclose(half, np.pad(expected, BORDER, mode="edge"), rtol=1e-6)
     np.testing.assert_array_equal(level(pyramid, 0), np.pad(picture, BORDER, mode="edge"))
-
-
-def test_the_margin_of_instruments_is_that_of_the_whole_picture() -> None:
-    tissue = np.ones((512, 640), np.bool_)
-    tissue[256, 320] = False
-    clear = clear_of_instruments(tissue, 1)
-    assert clear.shape == (256, 320)
-    np.testing.assert_array_equal(np.argwhere(~clear).min(0), [128 - 10, 160 - 10])
-    np.testing.assert_array_equal(np.argwhere(~clear).max(0), [128 + 10, 160 + 10])
 
 
 # ---- inverse search --------------------------------------------------------------------------------------
@@ -116,16 +105,6 @@ def test_a_tether_holds_rows_where_there_is_nothing_to_say_otherwise() -> None:
     begin[..., 1:] = 0.4
     field = search(first, bordered(shifted(stripes, 0.5, 0)), 4, begin, 6, tether=0.7)
     np.testing.assert_allclose(field[..., 1], 0.4, atol=1e-3)
-
-
-def test_a_linear_field_starts_a_finer_one_as_it_is() -> None:
-    coarse, fine = bordered(texture(48, 40)), bordered(texture(96, 80))
-    across, down = centres(coarse, 4)
-    field = start(fine, 4, np.dstack([0.1 * across, 0.2 * down]).astype(np.float32), 4, (PATCH - 1) / 2, 2)
-    across, down = centres(fine, 4)
-    inner_patches = np.s_[2:-3, 2:-3]
-    np.testing.assert_allclose(field[..., 0][inner_patches], 0.1 * (across - 0.5)[inner_patches], atol=1e-4)
-    np.testing.assert_allclose(field[..., 1][inner_patches], 0.2 * (down - 0.5)[inner_patches], atol=1e-4)
 
 
 @pytest.mark.parametrize("stride", [4, 6])
@@ -188,15 +167,6 @@ def test_trust_is_lost_to_what_cannot_be_and_to_nearer_surfaces() -> None:
         row[hidden] = 0
     assert 0.02 < (expected > 0).mean() < 0.3
     np.testing.assert_allclose(trust, expected, atol=1e-5)
-
-
-@pytest.mark.parametrize("disparity", [3, 11, 17])
-def test_the_guess_is_right_to_a_pixel(disparity: int) -> None:
-    scene = texture(WIDTH + 32)
-    left, right = scene[:, 16 : 16 + WIDTH], scene[:, 16 + disparity : 16 + disparity + WIDTH]
-    guess = coarse_disparity(bordered(left), bordered(right), 2.0, 20.0)
-    seen = guess[4:-4, disparity + 4 : -4]
-    assert np.mean(np.abs(seen - disparity) < 0.5) > 0.97
 
 
 # ---- smoothing -------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """Depth by networks of every convention, in real ONNX Runtime sessions, and what happens when one fails."""
 
 import logging
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -20,21 +21,17 @@ from sags_node.config.schema import OnnxConfig, StereoConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.findings import by_code
 from sags_node.mapping.budget import StepBudget
-from sags_node.messaging.content import status
-from sags_node.node.health import Statistics
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
-from sags_node.types import F32, U8, Bool, FrameResult, RectifiedPair, StereoFrame
+from sags_node.types import F32, U8, Bool, FrameResult, StereoFrame
 from sags_node.vision.mono_depth import MonoDepth, fit_scale_shift
 from sags_node.vision.onnx_depth import DepthNetwork
 from sags_node.vision.onnx_session import DepthNetworkError
 from sags_node.vision.rectify import Rectifier
-from sags_node.vision.stereo import StereoDepth
 from sags_node.vision.watch.pair_watch import PairWatch
 from sags_node.vision.watch.scene_watch import SceneWatch
 
 WIDTH, HEIGHT = 320, 256
-PICTURE = [1, 3, "h", "w"]
 FRAMES = 30
 
 
@@ -70,6 +67,11 @@ def truth(frame: StereoFrame) -> F32:
     return frame.reference.depth
 
 
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "network.onnx"
+
+
 def load(path: Path, scene: Scene, **said: Any) -> DepthNetwork:
     return DepthNetwork(OnnxConfig(path=path, threads=2, **said), (WIDTH, HEIGHT), scene.focal_baseline)
 
@@ -84,75 +86,54 @@ def error(network: DepthNetwork, scene: Scene) -> float:
 
 PAIR: dict[str, Any] = {"inputs": ("first", "second"), "meaning": "disparity", "normalization": "bytes"}
 OPEN = {**PAIR, "multiple": 32}  # a network that takes any size
+HITNET = {"meaning": "disparity", "normalization": "unit"}
+LIGHT_STEREO = {"inputs": ("left_img", "right_img"), "meaning": "disparity", "normalization": "imagenet"}
+GUIDED = ("init_left", "init_right", "first", "second")
 FIXED = (WIDTH, HEIGHT)
+NETWORKS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # how they are made, and described
+    "any size": ({}, OPEN),
+    "any size, one is chosen": ({}, PAIR | {"size": (256, 192)}),
+    "only the width is fixed": ({"size": (300, "h")}, OPEN),
+    "only the width is fixed, a height is chosen": ({"size": (300, "h")}, PAIR | {"size": (300, 240)}),
+    "larger than the image": ({"size": (448, 320)}, PAIR),
+    "LightStereo's": ({"expects": "imagenet", "size": FIXED, "names": LIGHT_STEREO["inputs"]}, LIGHT_STEREO),
+    "HITNet's": ({"concatenated": True, "expects": "unit", "size": FIXED}, HITNET),
+    "HITNet's, in grey": (
+        {"concatenated": True, "channels": 1, "expects": "unit"}, HITNET | {"multiple": 1}
+    ),
+    "CREStereo's": ({"size": FIXED, "guided": True}, PAIR | {"inputs": GUIDED}),
+    "RAFT-Stereo's: negative": ({"factor": -1.0}, OPEN | {"scale": -1}),
+    "channels last": ({"nhwc": True, "expects": "symmetric"}, OPEN | {"normalization": "symmetric"}),
+    "channels last, whole levels": ({"nhwc": True, "uint8": True}, {**OPEN, "normalization": None}),
+    "its right input is the first": ({"names": ("left", "a_right")}, OPEN | {"inputs": ("left", "a_right")}),
+    "half the size, in its px": ({"output": "half", "factor": 0.5}, OPEN | {"scale": 2}),
+    "one of several outputs": ({"output": "several"}, OPEN | {"output": "final"}),
+    "depth of this rig, in mm": ({"depth_of": 1000.0}, OPEN | {"meaning": "depth", "scale": 1e-3}),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("made", "said"),
-    [
-        ({"expects": "bytes"}, OPEN),
-        ({"expects": "unit"}, OPEN | {"normalization": "unit"}),
-        (  # LightStereo's form
-            {"expects": "imagenet", "size": FIXED, "names": ("left_img", "right_img")},
-            PAIR | {"inputs": ("left_img", "right_img"), "normalization": "imagenet"},
-        ),
-        ({}, PAIR | {"size": (256, 192)}),
-        ({"expects": "symmetric"}, OPEN | {"normalization": "symmetric"}),
-        ({"nhwc": True, "uint8": True}, {**OPEN, "normalization": None}),
-        ({"nhwc": True, "expects": "unit"}, OPEN | {"normalization": "unit"}),
-        (  # HITNet's
-            {"concatenated": True, "expects": "unit", "size": FIXED},
-            {"meaning": "disparity", "normalization": "unit"},
-        ),
-        (
-            {"concatenated": True, "channels": 1, "expects": "unit"},
-            {"meaning": "disparity", "normalization": "unit", "multiple": 1},
-        ),
-        ({"channels": 1}, OPEN),
-        ({"size": FIXED}, PAIR),
-        ({"size": (448, 320)}, PAIR),
-        (  # CREStereo's
-            {"size": FIXED, "guided": True},
-            PAIR | {"inputs": ("init_left", "init_right", "first", "second")},
-        ),
-        ({"size": (300, "h")}, OPEN),
-        ({"size": (300, "h")}, PAIR | {"size": (300, 240)}),  # the height alone is open
-        ({"names": ("left", "a_right")}, OPEN | {"inputs": ("left", "a_right")}),  # the right one is first
-        ({"factor": -1.0}, OPEN | {"scale": -1}),  # RAFT-Stereo's
-        ({"factor": 1 / 320}, OPEN | {"scale": 320}),  # widths of the image
-        ({"output": "half"}, OPEN),
-        ({"output": "half", "factor": 0.5}, OPEN | {"scale": 2}),  # px of the smaller map
-        ({"output": "several"}, OPEN | {"output": "final"}),
-        ({"depth_of": 1.0}, OPEN | {"meaning": "depth"}),  # of this rig, in metres, and in millimetres
-        ({"depth_of": 1000.0}, OPEN | {"meaning": "depth", "scale": 1e-3}),
-    ],
-    ids=str,
-)
-def test_a_stereo_network_is_fed_and_read_as_it_is_described(
-    made: dict[str, Any], said: dict[str, Any], scene: Scene, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_stereo_network_is_fed_and_read_as_it_is_described(name: str, scene: Scene, path: Path) -> None:
+    made, said = NETWORKS[name]
     if "depth_of" in made:
         made = {"depth_of": made["depth_of"] * scene.focal_baseline}
-    network = load(save_matcher(tmp_path / "network.onnx", **made), scene, **said)
+    network = load(save_matcher(path, **made), scene, **said)
     assert network.is_stereo and network.processor == "cpu"
     assert error(network, scene) < 0.6
 
 
-def test_a_size_that_is_no_multiple_is_padded_and_cut_off_again(scene: Scene, tmp_path: Path) -> None:
-    config = OnnxConfig(path=save_matcher(tmp_path / "network.onnx"), threads=2, **OPEN)
+def test_a_size_that_is_no_multiple_is_padded_and_cut_off_again(scene: Scene, path: Path) -> None:
+    config = OnnxConfig(path=save_matcher(path), threads=2, **OPEN)
     odd = Scene(scene.left[:-3, :-5], scene.right[:-3, :-5], *(a[:-3, :-5] for a in scene[2:4]), 1.0)
-    network = DepthNetwork(config, (WIDTH - 5, HEIGHT - 3), scene.focal_baseline)
-    assert error(network, odd) < 0.6
+    assert error(DepthNetwork(config, (WIDTH - 5, HEIGHT - 3), scene.focal_baseline), odd) < 0.6
 
 
 # ---- what is said, and what is missing -------------------------------------------------------------------
 
 
-def test_metadata_sidecar_and_launch_file_say_more_in_this_order(scene: Scene, tmp_path: Path) -> None:
-    in_file = {"inputs": "[first, second]", "meaning": "disparity", "multiple": "32", "scale": "-1"}
-    path = save_matcher(
-        tmp_path / "network.onnx", metadata={**in_file, "normalization": "unit", "author": "somebody"}
-    )
+def test_metadata_sidecar_and_launch_file_say_more_in_this_order(scene: Scene, path: Path) -> None:
+    said = {"inputs": "[first, second]", "meaning": "disparity", "multiple": "32", "scale": "-1"}
+    save_matcher(path, metadata={**said, "normalization": "unit", "author": "somebody"})
     assert error(load(path, scene, normalization="bytes", scale=1.0), scene) < 0.6
     assert error(load(path, scene), scene) > 5
     path.with_suffix(".yaml").write_text("normalization: bytes\nscale: 1\n")
@@ -160,25 +141,25 @@ def test_metadata_sidecar_and_launch_file_say_more_in_this_order(scene: Scene, t
     assert error(load(path, scene, scale=-1.0), scene) > 5
 
 
-def test_a_name_of_digits_is_a_name(scene: Scene, tmp_path: Path) -> None:
+def test_a_name_of_digits_is_a_name(scene: Scene, path: Path) -> None:
     """PyTorch gives such names; in YAML they are numbers."""
-    said = {"inputs": "[10, 11]", "output": "6187"}
-    path = save_matcher(tmp_path / "network.onnx", names=("10", "11"), output="6187", metadata=said)
     more = {key: value for key, value in OPEN.items() if key != "inputs"}
-    assert error(load(path, scene, **more), scene) < 0.6
-    path = save_matcher(path, names=("10", "11"), output="6187")
-    path.with_suffix(".yaml").write_text("inputs: [10, 11]\noutput: 6187\n")
-    assert error(load(path, scene, **more), scene) < 0.6
+    for metadata, sidecar in [
+        ({"inputs": "[10, 11]", "output": "6187"}, "{}"),
+        ({}, "{inputs: [10, 11], output: 6187}"),
+    ]:
+        save_matcher(path, names=("10", "11"), output="6187", metadata=metadata)
+        path.with_suffix(".yaml").write_text(sidecar)
+        assert error(load(path, scene, **more), scene) < 0.6
     vision = load_launch(None, ["vision.onnx.inputs:=[10, 11]", "vision.onnx.output:=6187"]).vision
     assert (vision.onnx.inputs, vision.onnx.output) == (("10", "11"), "6187")
 
 
 @pytest.mark.parametrize("key", ["inputs", "normalization", "multiple", "output", "meaning"])
-def test_what_is_missing_is_named_with_what_the_file_says(key: str, scene: Scene, tmp_path: Path) -> None:
-    path = save_matcher(tmp_path / "network.onnx", output="several")
+def test_what_is_missing_is_named_with_what_the_file_says(key: str, scene: Scene, path: Path) -> None:
     said = {**OPEN, "output": "final"}
     with pytest.raises(UsageError) as caught:
-        load(path, scene, **{**said, key: None})
+        load(save_matcher(path, output="several"), scene, **{**said, key: None})
     text = str(caught.value)
     assert "inputs: first 1x3xhxw tensor(float), second 1x3xhxw" in text and "outputs: certainty " in text
     _, _, missing = text.partition(" beside it: ")
@@ -186,54 +167,22 @@ def test_what_is_missing_is_named_with_what_the_file_says(key: str, scene: Scene
     assert named == [key] and "\n" not in text and "docs/networks.md" in text
 
 
-def test_an_open_shape_does_not_say_where_the_channels_are(scene: Scene, tmp_path: Path) -> None:
-    path = save_odd(tmp_path / "network.onnx", {"a": [1, "a", "b", "c"]}, "same")
+def test_an_open_shape_does_not_say_where_the_channels_are(scene: Scene, path: Path) -> None:
+    save_odd(path, {"a": [1, "a", "b", "c"]}, "same")
     said = {"normalization": "unit", "meaning": "inverse_depth", "multiple": 1}
     with pytest.raises(UsageError, match=r"layout \(nchw or nhwc\)"):
         load(path, scene, **said)
     assert load(path, scene, **said, layout="nchw")(scene.left, None).shape == (HEIGHT, WIDTH)
 
 
-MATCHER: dict[str, Any] = {}
-AS_ODD = {"normalization": "unit", "multiple": 1, "meaning": "disparity"}
+def odd(output: str = "same", **inputs: Sequence[Any]) -> Callable[[Path], None]:
+    """A network of those inputs, and beside it what it needs but for the size."""
 
+    def save(path: Path) -> None:
+        said = {"normalization": "unit", "meaning": "disparity", "inputs": list(inputs)}
+        save_odd(path, inputs, output).with_suffix(".yaml").write_text(yaml.safe_dump(said))
 
-@pytest.mark.parametrize(
-    ("inputs", "output", "sidecar", "words"),
-    [
-        (MATCHER, "", "normalisation: unit", "unknown key 'normalisation'; did you mean 'normalization'"),
-        (MATCHER, "", "normalization: half", "normalization: .*one of unit, bytes, imagenet, symmetric"),
-        (MATCHER, "", "- 1", "a map of keys"),
-        (MATCHER, "", "a: [", "not valid YAML"),
-        (MATCHER, "", "meaning: inverse_depth", "meaning: a stereo network gives disparity or depth"),
-        (MATCHER, "", "inputs: [left, right]", "inputs: its inputs are first, second"),
-        (MATCHER, "", "output: depth", "output: its outputs are disparity"),
-        (MATCHER, "", "scale: 0", "network.yaml: scale: .*should not be 0"),
-        ({"x": [1, 3, 64, 96]}, "same", "size: [128, 96]", "size: 128x96 px, but its file takes 96x64 alone"),
-        ({"x": [1, 3, "h", 96]}, "same", "size: [128, 96]", "size: 128x96 px, but its file takes 96x96 alo"),
-        ({"x": [1, 3, 64, 96]}, "same", "multiple: 10", "multiple: 10 px, but file or size fix 96x64"),
-        (MATCHER, "", "{size: [128, 96], multiple: 10}", "multiple: 10 px, but file or size fix 128x96"),
-        ({"x": [1, 3, 64, 96]}, "sequence", "multiple: 32", "network.onnx gives no tensor: outputs: out seq"),
-        ({"x": [1, 10]}, "same", "", "network.onnx: input x is 1x10; an image is"),
-        ({"x": [4, 3, "h", "w"]}, "same", "", "network.onnx: .*batch size 1"),
-        ({"a": PICTURE, "b": PICTURE, "c": PICTURE}, "same", "", r"network.onnx takes 3 inputs \(a, b, c\)"),
-        ({"a": [1, 5, 64, 64], "b": [1, 5, 64, 64]}, "same", "", "network.onnx: .*a (has 5|is 1x5x64x64)"),
-        ({"a": PICTURE, "b": PICTURE}, "small", "", "network.onnx: .*out is not a map of the 320x256 px"),
-        ({"a": [1, 3, 5000, 5000]}, "same", "", "network.onnx: .*more than 4096 px"),
-    ],
-)  # fmt: skip
-def test_a_wrong_network_or_description_is_refused_in_one_line_with_its_fix(
-    inputs: dict[str, Sequence[Any]], output: str, sidecar: str, words: str, scene: Scene, tmp_path: Path
-) -> None:
-    path, said = tmp_path / "network.onnx", AS_ODD | {"inputs": tuple(inputs)} if inputs else {}
-    if "multiple" in sidecar:
-        said = {key: value for key, value in said.items() if key != "multiple"}
-    path = save_odd(path, inputs, output) if inputs else save_matcher(path)
-    if sidecar:
-        path.with_suffix(".yaml").write_text(sidecar)
-    with pytest.raises(UsageError, match=words) as caught:
-        load(path, scene, **said)
-    assert "\n" not in str(caught.value)
+    return save
 
 
 def cut_short(path: Path) -> None:
@@ -241,36 +190,62 @@ def cut_short(path: Path) -> None:
 
 
 def too_large(path: Path) -> None:
+    """It is not opened: that would be said to be no model."""
     with path.open("wb") as sparse:
         sparse.truncate(2**31 + 1)
 
 
+PICTURE = [1, 3, "h", "w"]
+SMALL = odd(x=[1, 3, 64, 96])
+
+
 @pytest.mark.parametrize(
-    ("save", "words"),
+    ("save", "said", "words"),
     [
-        (lambda path: None, "is no file; check the path"),
-        (lambda path: path.write_text("not a model\n"), "is no ONNX model that can be run"),
-        (cut_short, "is no ONNX model that can be run"),
-        (too_large, "2 GB at most"),  # it is not opened: that would be said to be no model
+        (lambda path: None, "", "is no file; check the path"),
+        (lambda path: path.write_text("not a model\n"), "", "is no ONNX model that can be run"),
+        (cut_short, "", "is no ONNX model that can be run"),
+        (too_large, "", "2 GB at most"),
+        (save_matcher, "normalisation: unit", "unknown key 'normalisation'; did you mean 'normalization'"),
+        (save_matcher, "normalization: half", "normalization: .*one of unit, bytes, imagenet, symmetric"),
+        (save_matcher, "- 1", "a map of keys"),
+        (save_matcher, "a: [", "not valid YAML"),
+        (save_matcher, "meaning: inverse_depth", "meaning: a stereo network gives disparity or depth"),
+        (save_matcher, "inputs: [left, right]", "inputs: its inputs are first, second"),
+        (save_matcher, "output: depth", "output: its outputs are disparity"),
+        (save_matcher, "scale: 0", "network.yaml: scale: .*should not be 0"),
+        (save_matcher, "{size: [128, 96], multiple: 10}", "multiple: 10 px, but file or size fix 128x96"),
+        (SMALL, "size: [128, 96]", "size: 128x96 px, but its file takes 96x64 alone"),
+        (odd(x=[1, 3, "h", 96]), "size: [128, 96]", "size: 128x96 px, but its file takes 96x96 alo"),
+        (SMALL, "multiple: 10", "multiple: 10 px, but file or size fix 96x64"),
+        (odd("sequence", x=[1, 3, 64, 96]), "multiple: 32", "network.onnx gives no tensor: outputs: out seq"),
+        (odd(x=[1, 10]), "multiple: 1", "network.onnx: input x is 1x10; an image is"),
+        (odd(x=[4, 3, "h", "w"]), "multiple: 1", "network.onnx: .*batch size 1"),
+        (odd(a=PICTURE, b=PICTURE, c=PICTURE), "multiple: 1", r"network.onnx takes 3 inputs \(a, b, c\)"),
+        (odd(a=[1, 5, 64, 64], b=[1, 5, 64, 64]), "multiple: 1", "network.onnx: .*a (has 5|is 1x5x64x64)"),
+        (odd("small", a=PICTURE, b=PICTURE), "multiple: 1", "network.onnx: .*out is not a map of the 320"),
+        (odd(a=[1, 3, 5000, 5000]), "multiple: 1", "network.onnx: .*more than 4096 px"),
     ],
-)
-def test_a_file_that_is_no_network_is_refused(
-    save: Callable[[Path], object],
-    words: str,
-    scene: Scene,
-    tmp_path: Path,
+    ids=lambda value: "" if callable(value) else value,
+)  # fmt: skip
+def test_a_wrong_network_or_description_is_refused_in_one_line_with_its_fix(
+    save: Callable[[Path], object], said: str, words: str, scene: Scene, path: Path,
     capfd: pytest.CaptureFixture[str],
-) -> None:
-    save(tmp_path / "network.onnx")
-    with pytest.raises(UsageError, match=words):
-        load(tmp_path / "network.onnx", scene)
+) -> None:  # fmt: skip
+    save(path)
+    sidecar = path.with_suffix(".yaml")
+    if said:
+        sidecar.write_text(f"{sidecar.read_text() if sidecar.exists() else ''}{said}\n")
+    with pytest.raises(UsageError, match=words) as caught:
+        load(path, scene)
+    assert "\n" not in str(caught.value)
     assert capfd.readouterr() == ("", "")  # the runtime says nothing of its own
 
 
-def test_a_provider_that_is_not_there_is_passed_over(scene: Scene, tmp_path: Path) -> None:
+def test_a_provider_that_is_not_there_is_passed_over(scene: Scene, path: Path) -> None:
     import onnxruntime
 
-    path = save_matcher(tmp_path / "network.onnx")
+    save_matcher(path)
     assert load(path, scene, **OPEN, providers=("cuda", "cpu")).processor in ("cuda", "cpu")
     if "CUDAExecutionProvider" not in onnxruntime.get_available_providers():
         with pytest.raises(UsageError, match="none of cuda"):
@@ -279,16 +254,21 @@ def test_a_provider_that_is_not_there_is_passed_over(scene: Scene, tmp_path: Pat
 
 # ---- through the pipeline --------------------------------------------------------------------------------
 
+Build = Callable[..., Pipeline]
 
-def pipeline_with(session: Path, network: Path, *overrides: str) -> Pipeline:
-    said = ["source.pace:=step", f"vision.onnx.path:={network}", "vision.onnx.threads:=2", *overrides]
-    if network.stem == "matcher":
-        said += ["vision.onnx.inputs:=[first, second]", "vision.onnx.normalization:=bytes"]
-        said += ["vision.onnx.multiple:=32", "vision.onnx.meaning:=disparity"]
-    else:
-        said += ["vision.onnx.normalization:=imagenet", "vision.onnx.meaning:=inverse_depth"]
-    opened = open_session(session, said)
-    return Pipeline(opened.config, opened.rig)
+
+@pytest.fixture
+def build(phantom_session: Path, path: Path) -> Build:
+    """A pipeline with the monocular network of a file, or with a matcher that is made so."""
+
+    def build(network: Path | None, *overrides: str, **made: Any) -> Pipeline:
+        said = {"path": network or save_matcher(path, **made), "threads": 2}
+        said |= {"normalization": "imagenet", "meaning": "inverse_depth"} if network else OPEN
+        shown = [f"vision.onnx.{key}:={list(v) if key == 'inputs' else v}" for key, v in said.items()]
+        opened = open_session(phantom_session, ["source.pace:=step", *shown, *overrides])
+        return Pipeline(opened.config, opened.rig)
+
+    return build
 
 
 def play(pipeline: Pipeline, frames: Sequence[StereoFrame]) -> list[FrameResult]:
@@ -320,53 +300,37 @@ def one_eye(frame: StereoFrame) -> StereoFrame:
     return replace(frame, right=None)
 
 
-def test_a_network_replaces_the_matcher(
-    phantom_session: Path, frames: list[StereoFrame], tmp_path: Path
-) -> None:
-    pipeline = pipeline_with(phantom_session, save_matcher(tmp_path / "matcher.onnx"))
-    for result, frame in zip(play(pipeline, frames[:3]), frames, strict=False):
-        off, share = depth_error(result, frame)
-        assert off < 0.02 and share > 0.6 and not result.skipped
-        matched, _ = pipeline.depth.stereo(result.pair, result.observation.tissue)
-        assert not np.array_equal(matched, result.observation.depth)
-        confidence = result.observation.depth_confidence
-        assert ((confidence > 0) <= (result.observation.depth > 0)).all() and confidence.max() <= 1
-
-
 @pytest.fixture
 def unwatched(monkeypatch: pytest.MonkeyPatch) -> None:
     """Dark images are taken in: else no network would ever see one."""
-    monkeypatch.setattr(PairWatch, "judge", lambda self, evidence, judged: judged)
-    monkeypatch.setattr(SceneWatch, "judge", lambda self, evidence, judged: judged)
+    for watch in (PairWatch, SceneWatch):
+        monkeypatch.setattr(watch, "judge", lambda self, evidence, judged: judged)
 
 
 @pytest.mark.fault("network: a depth network fails or gives NaN")
 @pytest.mark.usefixtures("unwatched")
 @pytest.mark.parametrize(("fault", "words"), [("nan", "not finite"), ("error", "failed: .*(Gather|indices)")])
-def test_where_it_fails_the_matcher_takes_over_and_says_so(
-    fault: str, words: str, phantom_session: Path, frames: list[StereoFrame], tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-) -> None:  # fmt: skip
-    pipeline = pipeline_with(phantom_session, save_matcher(tmp_path / "matcher.onnx", fault=fault))
+def test_a_network_replaces_the_matcher_which_takes_over_where_it_fails_and_says_so(
+    fault: str, words: str, build: Build, frames: list[StereoFrame], caplog: pytest.LogCaptureFixture
+) -> None:
+    pipeline = build(None, fault=fault)
     shown = [frames[0], dark(frames[1]), frames[2], *map(dark, frames[3:7]), frames[7]]
     with caplog.at_level(logging.WARNING):
         results = play(pipeline, shown)
     failed = [bool(result.skipped.get("network")) for result in results]
     assert failed == [False, True, False, True, True, True, True, True]  # the last: not tried any more
-    result = results[1]
-    matched, _ = pipeline.depth.stereo(result.pair, result.observation.tissue)
-    kept = result.observation.depth > 0  # all but specks, of which so dark an image has some
-    assert np.array_equal(result.observation.depth[kept], matched[kept])
-    assert np.count_nonzero(kept) > 0.5 * np.count_nonzero(matched)
-    statistics = Statistics()
-    statistics.add(result, 1.0, {})
-    health = statistics.health(
-        dropped={}, stopping=False, paused=False, error=None, warnings=pipeline.warnings, connections={},
-        views={},
-    )  # fmt: skip
-    assert health.skipped == {"network": 1} and health.warnings["network"][0].text.startswith("matcher.onnx")
-    reason = status(health, result)["last_frame"]["skipped"]["network"]
-    assert reason.startswith("matcher.onnx") and "\n" not in reason
+    matched = [pipeline.depth.stereo(each.pair, each.observation.tissue)[0] for each in results[:2]]
+    seen = results[0].observation
+    off, share = depth_error(results[0], frames[0])
+    assert off < 0.02 and share > 0.6 and not np.array_equal(matched[0], seen.depth)
+    assert ((seen.depth_confidence > 0) <= (seen.depth > 0)).all() and seen.depth_confidence.max() <= 1
+    depth = results[1].observation.depth
+    kept = depth > 0  # all but specks, of which so dark an image has some
+    assert np.array_equal(depth[kept], matched[1][kept])
+    assert np.count_nonzero(kept) > 0.5 * np.count_nonzero(matched[1])
+    reason = results[1].skipped["network"]
+    assert re.search(words, reason) and reason.startswith("network.onnx") and "\n" not in reason
+    assert by_code(pipeline.warnings)["network_failed"].startswith("network.onnx")
     assert [record.levelname for record in caplog.records] == ["WARNING"] * 3  # twice news, once the end
     assert "3 times in a row: not tried again" in results[-1].skipped["network"]
 
@@ -375,19 +339,18 @@ def test_where_it_fails_the_matcher_takes_over_and_says_so(
 @pytest.mark.parametrize(
     ("made", "said"),
     [
-        ({"factor": -1.0}, ""),
-        ({"output": "half", "factor": 0.5}, ""),  # px of the smaller map
-        ({"factor": 1 / 320}, ""),  # widths of the image
-        ({"names": ("second", "first")}, ""),  # the eyes are exchanged
-        ({}, "vision.onnx.scale:=1.2"),
+        ({"factor": -1.0}, ()),
+        ({"output": "half", "factor": 0.5}, ()),  # px of the smaller map
+        ({"factor": 1 / 320}, ()),  # widths of the image
+        ({"names": ("second", "first")}, ()),  # the eyes are exchanged
+        ({}, ("vision.onnx.scale:=1.2",)),
     ],
     ids=str,
 )
 def test_a_network_that_is_described_wrongly_is_told_of_and_not_used(
-    made: dict[str, Any], said: str, phantom_session: Path, frames: list[StereoFrame], tmp_path: Path
+    made: dict[str, Any], said: tuple[str, ...], build: Build, frames: list[StereoFrame]
 ) -> None:
-    network = save_matcher(tmp_path / "matcher.onnx", **made)
-    pipeline = pipeline_with(phantom_session, network, *filter(None, [said]))
+    pipeline = build(None, *said, **made)
     for result, frame in zip(play(pipeline, frames[:4]), frames, strict=False):
         assert "check vision.onnx: meaning, scale" in result.skipped["network"]
         off, share = depth_error(result, frame)
@@ -420,6 +383,12 @@ def knowing(
     return save_table(tmp_path_factory.mktemp("mono") / "network.onnx", pictures, np.stack(maps))
 
 
+def declared(frames: list[StereoFrame], times: float = 1.0) -> str:
+    """The distance of the first frame's tissue, or a wrong one."""
+    known = truth(frames[0])
+    return f"vision.onnx.declared_depth:={times * float(np.median(known[known > 0]))}"
+
+
 def test_a_monocular_network_takes_one_picture(knowing: Path, scene: Scene) -> None:
     network = load(knowing, scene, normalization="imagenet", meaning="inverse_depth")
     assert not network.is_stereo
@@ -429,7 +398,7 @@ def test_a_monocular_network_takes_one_picture(knowing: Path, scene: Scene) -> N
         load(knowing, scene, meaning="disparity")
 
 
-def test_scale_and_shift_are_found_among_outliers() -> None:
+def test_scale_and_shift_are_found_among_outliers_and_a_map_turned_round_is_refused() -> None:
     rng = np.random.default_rng(0)
     inverse = rng.uniform(10, 30, (100, 120))
     relative = (0.03 * inverse - 0.2 + rng.normal(0, 0.003, inverse.shape)).astype(np.float32)
@@ -441,34 +410,10 @@ def test_scale_and_shift_are_found_among_outliers() -> None:
     found = fit_scale_shift(relative, depth, everywhere)
     assert found.scale == pytest.approx(1 / 0.03, rel=0.02)
     assert found.shift == pytest.approx(0.2 / 0.03, abs=0.3)
-    assert fit_scale_shift(-relative, depth, everywhere) is None
     assert fit_scale_shift(np.ones_like(relative), depth, everywhere) is None
     assert fit_scale_shift(relative, depth * (np.arange(120) == 3), everywhere) is None  # 90 px
-
-
-def test_a_network_of_depth_is_turned_round(scene: Scene) -> None:
-    mono = MonoDepth(None, StereoConfig())
-    depth = np.where(scene.disparity > 0, scene.focal_baseline / np.maximum(scene.disparity, 1), 0)
-    depth = depth.astype(np.float32)
     with pytest.raises(DepthNetworkError, match="does not rise"):
-        mono(depth, scene.seen, lambda: depth)
-
-
-def test_one_eye_beside_stereo_is_aligned_to_it(
-    knowing: Path, phantom_session: Path, frames: list[StereoFrame], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Stereo is matched in every fifth frame; in between each is laid onto the one before."""
-    pipeline = pipeline_with(phantom_session, knowing)
-    matched: list[int] = []
-    match = StereoDepth.__call__
-
-    def counted(self: StereoDepth, pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
-        matched.append(pair.frame_id)
-        return match(self, pair, tissue)
-
-    monkeypatch.setattr(StereoDepth, "__call__", counted)
-    check_depth(play(pipeline, frames[:16]), frames, 0.02)
-    assert matched == [0, 5, 10, 15]
+        MonoDepth(None, StereoConfig())(-np.nan_to_num(relative), everywhere, lambda: depth)
 
 
 def knocked(frame: StereoFrame, aside: int) -> StereoFrame:
@@ -482,28 +427,22 @@ def knocked(frame: StereoFrame, aside: int) -> StereoFrame:
 
 @pytest.mark.fault("network: a monocular one beside eyes whose matches are no depth")
 @pytest.mark.parametrize("aside", [0, -4])
-def test_a_monocular_network_is_not_laid_onto_matches_that_are_no_depth(
-    aside: int, knowing: Path, phantom_session: Path, frames: list[StereoFrame]
+def test_a_monocular_network_is_laid_onto_matches_but_not_where_they_are_no_depth(
+    aside: int, knowing: Path, build: Build, frames: list[StereoFrame]
 ) -> None:
-    """Nor is that a failure of the network: it goes on with the first match that is sound."""
-    pipeline = pipeline_with(phantom_session, knowing)
+    """That is no failure of the network: it goes on with the first match that is sound."""
     shown = [knocked(frame, aside) if 15 <= frame.frame_id < 23 else frame for frame in frames]
-    for place, (result, frame) in enumerate(zip(play(pipeline, shown), frames, strict=True)):
-        if 15 <= place < 23:
-            assert not result.observation.depth.any()
-            assert "so there is no depth" in result.skipped["depth"]
-            assert "network" not in result.skipped
-        else:
-            assert not result.skipped and depth_error(result, frame)[0] < 0.02
+    results = play(build(knowing), shown)
+    check_depth(results[:15] + results[23:], frames[:15] + frames[23:], 0.02)
+    for result in results[15:23]:
+        assert not result.observation.depth.any() and "network" not in result.skipped
+        assert "so there is no depth" in result.skipped["depth"]
 
 
 def test_one_camera_alone_keeps_the_declared_scale(
-    knowing: Path, phantom_session: Path, frames: list[StereoFrame]
+    knowing: Path, build: Build, frames: list[StereoFrame]
 ) -> None:
-    known = truth(frames[0])
-    declared = float(np.median(known[known > 0]))
-    pipeline = pipeline_with(phantom_session, knowing, f"vision.onnx.declared_depth:={declared}")
-    results = play(pipeline, list(map(one_eye, frames)))
+    results = play(build(knowing, declared(frames)), list(map(one_eye, frames)))
     check_depth(results, frames, 0.04)
     assert all(result.snapshot.loss < 0.05 for result in results[1:])
 
@@ -511,13 +450,11 @@ def test_one_camera_alone_keeps_the_declared_scale(
 @pytest.mark.fault("depth: one camera alone, its distance declared wrong")
 @pytest.mark.parametrize(("shown", "is_sure"), [(one_eye, False), (lambda frame: frame, True)])
 def test_a_declared_scale_makes_no_depth_sure(
-    shown: Callable[[StereoFrame], StereoFrame], is_sure: bool, knowing: Path, phantom_session: Path,
+    shown: Callable[[StereoFrame], StereoFrame], is_sure: bool, knowing: Path, build: Build,
     frames: list[StereoFrame],
 ) -> None:  # fmt: skip
     """Nothing tells that it is off by a half, but beside a right eye, which measures it."""
-    known = truth(frames[0])
-    wrong = 1.5 * float(np.median(known[known > 0]))
-    pipeline = pipeline_with(phantom_session, knowing, f"vision.onnx.declared_depth:={wrong}")
+    pipeline = build(knowing, declared(frames, times=1.5))
     last = play(pipeline, list(map(shown, frames[:12])))[-1]
     view, errors = last.views["left"], last.snapshot.gaussians.depth_errors
     assert last.observation.depth.any() and view.confidence is not None and errors is not None
@@ -540,21 +477,19 @@ def test_a_declared_scale_makes_no_depth_sure(
 )
 def test_what_no_other_depth_can_replace_ends_the_run(
     stereo: bool, shown: Callable[[StereoFrame], StereoFrame], override: str, error: type[SagsError],
-    words: str, knowing: Path, phantom_session: Path, frames: list[StereoFrame], tmp_path: Path,
+    words: str, knowing: Path, build: Build, frames: list[StereoFrame],
 ) -> None:  # fmt: skip
-    path = save_matcher(tmp_path / "matcher.onnx", fault="nan") if stereo else knowing
-    pipeline = pipeline_with(phantom_session, path, override)
+    pipeline = build(None, override, fault="nan") if stereo else build(knowing, override)
     with pytest.raises(error, match=words):
         play(pipeline, [shown(frames[0])])
 
 
 def test_where_one_camera_s_network_fails_depth_is_unknown(
-    pictures: np.ndarray, phantom_session: Path, frames: list[StereoFrame], tmp_path: Path
+    pictures: np.ndarray, build: Build, frames: list[StereoFrame], path: Path
 ) -> None:
     maps = np.full((2, HEIGHT, WIDTH), np.linspace(1, 2, WIDTH))
     maps[1] = np.nan
-    path = save_table(tmp_path / "network.onnx", pictures[:2], maps)
-    pipeline = pipeline_with(phantom_session, path, "vision.onnx.declared_depth:=0.07")
+    pipeline = build(save_table(path, pictures[:2], maps), "vision.onnx.declared_depth:=0.07")
     good, bad = play(pipeline, list(map(one_eye, frames[:2])))
     assert good.observation.depth.any() and "network" not in good.skipped
     assert not bad.observation.depth.any() and "not finite" in bad.skipped["network"]
@@ -582,17 +517,17 @@ def test_a_recording_of_one_camera_is_played(
     monkeypatch.chdir("/")  # its paths are those of its own folder
     session = open_session(launch, ["source.frames:=2"])
     assert session.config.publish.right is False  # as `auto` is where there is none
-    with session.source as source:
-        results = play(Pipeline(session.config, session.rig), list(source))
+    results = play(Pipeline(session.config, session.rig), played(session.config.source))
     assert len(results) == 2
     for result in results:
         depth = result.observation.depth
         assert result.pair.right is None and not result.skipped
         assert np.median(depth[depth > 0]) == pytest.approx(0.07, rel=0.02)
         assert len(result.snapshot.gaussians) > 200
-    with pytest.raises(UsageError, match=r"source\.right is missing: .*vision\.onnx\.path"):
-        open_session(launch, ["vision.onnx.path:=null"])
-    with pytest.raises(UsageError, match=r"publish\.right: there is no right eye"):
-        open_session(launch, ["publish.right:=true"])
-    with pytest.raises(UsageError, match=r"cannot read calibration|does not exist"):
-        open_session(launch, ["rig:=/nowhere/ost.yaml"])
+    for override, words in [
+        ("vision.onnx.path:=null", r"source\.right is missing: .*vision\.onnx\.path"),
+        ("publish.right:=true", r"publish\.right: there is no right eye"),
+        ("rig:=/nowhere/ost.yaml", r"cannot read calibration|does not exist"),
+    ]:
+        with pytest.raises(UsageError, match=words):
+            open_session(launch, [override])

@@ -83,35 +83,27 @@ def row_errors(left: U8, right: U8) -> np.ndarray:
     return np.array([points[1][m.trainIdx].pt[1] - points[0][m.queryIdx].pt[1] for m in best])
 
 
-def test_rectified_pictures_of_the_right_size_pass_untouched() -> None:
-    rig = load_rig(ROOT / "calib/d4d")
-    image = np.random.default_rng(0).integers(0, 256, (540, 675, 3), np.uint8)
-    pair = Rectifier(rig, 675, 540)(make_frame(image, image))
-    assert pair.left is image
-    assert (pair.frame_id, pair.t_capture_ns) == (7, 1_000)
-    assert pair.baseline == pytest.approx(0.00427)
-
-
-def test_the_frame_pose_is_the_camera_pose() -> None:
-    rectifier = Rectifier(load_rig(ROOT / "calib/d4d"), 640, 512)
-    image = np.zeros((540, 675, 3), np.uint8)
-    T = np.eye(4)
+def test_rectified_pictures_of_the_right_size_pass_untouched_and_the_frames_pose_is_the_cameras() -> None:
+    rectifier, T = Rectifier(load_rig(ROOT / "calib/d4d"), 675, 540), np.eye(4)
     T[:3, 3] = [0.01, 0.02, 0.03]
-    posed = StereoFrame(1, 0, 0, image, image, T_world_cam=T)
-    np.testing.assert_array_equal(rectifier(posed).camera.T_world_cam, T)
-    np.testing.assert_array_equal(rectifier(make_frame(image, image)).camera.T_world_cam, np.eye(4))
+    image = np.random.default_rng(0).integers(0, 256, (540, 675, 3), np.uint8)
+    for pose, expected in ((None, np.eye(4)), (T, T)):
+        pair = rectifier(StereoFrame(7, 1_000, 2_000, image, image, T_world_cam=pose))
+        assert pair.left is image and (pair.frame_id, pair.t_capture_ns) == (7, 1_000)
+        assert pair.baseline == pytest.approx(0.00427)
+        np.testing.assert_array_equal(pair.camera.T_world_cam, expected)
 
 
 def test_pictures_of_another_size_are_refused() -> None:
     rectifier = Rectifier(load_rig(ROOT / "calib/d4d"), 640, 512)
-    good, bad = np.zeros((540, 675, 3), np.uint8), np.zeros((480, 640, 3), np.uint8)
-    with pytest.raises(SagsError, match="the right image is 640x480 px, the left image 675x540"):
-        rectifier(make_frame(good, bad))
-    with pytest.raises(SagsError, match="have another shape"):
-        rectifier(make_frame(bad, bad))
-    twice = np.zeros((1080, 1350, 3), np.uint8)
-    with pytest.raises(SagsError, match=f"sags calib convert {ROOT / 'calib/d4d'} -o FOLDER --scale 2$"):
-        rectifier(make_frame(twice, twice))
+    good, bad, twice = (np.zeros((*size, 3), np.uint8) for size in ((540, 675), (480, 640), (1080, 1350)))
+    for left, right, words in [
+        (good, bad, "the right image is 640x480 px, the left image 675x540"),
+        (bad, bad, "have another shape"),
+        (twice, twice, f"sags calib convert {ROOT / 'calib/d4d'} -o FOLDER --scale 2$"),
+    ]:
+        with pytest.raises(SagsError, match=words):
+            rectifier(make_frame(left, right))
     with pytest.raises(SagsError, match="mask is 640x480 px, the left image 675x540"):
         rectifier.mask(np.zeros((480, 640), np.bool_))
 
@@ -127,8 +119,7 @@ def test_masks_go_the_way_of_the_pictures() -> None:
     assert sure.mean() > 0.95
     found = rectifier.mask(mask)
     np.testing.assert_array_equal(found[sure], rectified[sure] == 255)
-    of_mask = centroid(np.repeat(found.astype(np.uint8)[..., None], 3, -1))
-    np.testing.assert_allclose(of_mask, centroid(rectified[..., None]), atol=0.1)
+    np.testing.assert_allclose(centroid(found[..., None]), centroid(rectified[..., None]), atol=0.1)
 
 
 def test_outside_the_raw_picture_there_is_no_tissue() -> None:
@@ -136,8 +127,6 @@ def test_outside_the_raw_picture_there_is_no_tissue() -> None:
     P = plain.left.P.copy()
     P[0, 2] += 100  # the rectified image looks 100 px past the raw one's left edge
     eye = Eye(675, 540, plain.left.K, plain.left.distortion, plain.left.R, P)
-    everything = Rectifier(StereoRig("shifted", eye, plain.right), 675, 540).mask(
-        np.ones((540, 675), np.bool_)
-    )
-    assert not everything[:, :99].any()
-    assert everything[:, 101:].all()
+    shifted = Rectifier(StereoRig("shifted", eye, plain.right), 675, 540)
+    everything = shifted.mask(np.ones((540, 675), np.bool_))
+    assert not everything[:, :99].any() and everything[:, 101:].all()

@@ -1,6 +1,7 @@
 """Stereo depth: scenes with exact truth, and real recordings."""
 
-from collections.abc import Iterator
+import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,11 +15,9 @@ from sags_node.config.schema import StereoConfig, TissueConfig
 from sags_node.errors import UsageError
 from sags_node.rig import load_rig, read_rig
 from sags_node.sources.pictures import read_picture
-from sags_node.types import F32, U8, Bool, Camera, RectifiedPair
+from sags_node.types import F32, U8, Camera, RectifiedPair
 from sags_node.vision import dense_depth, inverse_search
-from sags_node.vision.depth import Measured
 from sags_node.vision.margin import EDGE_MARGIN
-from sags_node.vision.observe import observe
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.stereo import StereoDepth
 from sags_node.vision.tissue import TissueMask
@@ -58,33 +57,26 @@ def to_disparity(depth: F32) -> F32:
     return geometry.disparity_to_depth(depth, CAMERA.K[0, 0], BASELINE)
 
 
-@pytest.mark.parametrize(("scale", "median_px", "p99_px"), [(1, 0.05, 0.4), (2, 0.1, 0.6), (4, 0.2, 1.8)])
-def test_slanted_plane(scale: int, median_px: float, p99_px: float) -> None:
-    pair, truth = plane_pair(28.0, 0.02, -0.01)
-    stereo = StereoDepth(StereoConfig(scale=scale), CAMERA, BASELINE)
-    depth, confidence = stereo(pair, ALL)
+@pytest.mark.parametrize(
+    ("width", "height", "scale", "median_px", "p99_px"),
+    [(640, 512, 1, 0.05, 0.4), (640, 512, 2, 0.1, 0.6), (640, 512, 4, 0.2, 1.8), (637, 509, 4, 0.4, 1.8)],
+)
+def test_slanted_plane(width: int, height: int, scale: int, median_px: float, p99_px: float) -> None:
+    """Also of a size that the scale does not divide."""
+    whole, truth = plane_pair(28.0, 0.02, -0.01)
+    part = np.s_[:height, :width]
+    camera, truth = Camera(width, height, CAMERA.K, np.eye(4)), truth[part]
+    pair = replace(whole, camera=camera, left=whole.left[part], right=whole.right[part])
+    depth, confidence = StereoDepth(StereoConfig(scale=scale), camera, BASELINE)(pair, ALL[part])
     known = depth > 0
     error = np.abs(to_disparity(depth) - truth)[known]
     visible = np.s_[:, 60:]  # columns whose match lies inside the right image
     assert known[visible].mean() > 0.95
     assert np.median(error) < median_px
     assert np.percentile(error, 99) < p99_px
-    unseen = np.arange(WIDTH) + 2 * scale < truth  # left of what the right image shows
+    unseen = np.arange(width) + 2 * scale < truth  # left of what the right image shows
     assert known[unseen].mean() < 0.01
-    assert depth.dtype == confidence.dtype == np.float32
-    assert depth.shape == confidence.shape == (HEIGHT, WIDTH)
     assert np.median(confidence[visible]) > 0.8
-
-
-def test_a_size_that_the_scale_does_not_divide() -> None:
-    pair, truth = plane_pair(28.0, 0.02, -0.01)
-    width, height = 637, 509
-    camera = Camera(width, height, CAMERA.K, np.eye(4))
-    cropped = RectifiedPair(0, 0, camera, BASELINE, pair.left[:height, :width], pair.right[:height, :width])
-    depth, _ = StereoDepth(StereoConfig(), camera, BASELINE)(cropped, ALL[:height, :width])
-    error = np.abs(to_disparity(depth) - truth[:height, :width])[depth > 0]
-    assert np.median(error) < 0.4
-    assert (depth > 0).mean() > 0.9
 
 
 def test_rows_off_by_the_calibration_still_match() -> None:
@@ -125,24 +117,17 @@ def test_a_cut_to_another_scene_leaves_no_trace() -> None:
     np.testing.assert_array_equal(again, first)
 
 
-@pytest.mark.parametrize("noise", [0.0, 3.0])
-def test_no_texture_no_depth(noise: float) -> None:
-    rng = np.random.default_rng(0)
-    left, right = (
-        np.clip(rng.normal(128, noise, (HEIGHT, WIDTH, 3)), 0, 255).astype(np.uint8) for _ in range(2)
-    )
-    depth, confidence = StereoDepth(StereoConfig(), CAMERA, BASELINE)(make_pair(left, right), ALL)
-    assert np.isfinite(depth).all()
-    assert np.isfinite(confidence).all()
-    assert (depth > 0).mean() < (0.1 if noise else 1e-9)
-    assert confidence.mean() < 0.02
-
-
-def test_eyes_that_see_different_things_are_seldom_matched() -> None:
-    pair = make_pair(texture(WIDTH, seed=1), texture(WIDTH, seed=2))
-    depth, confidence = StereoDepth(StereoConfig(), CAMERA, BASELINE)(pair, ALL)
-    assert (depth > 0).mean() < 0.05
-    assert confidence.mean() < 0.0125
+@pytest.mark.parametrize(
+    ("what", "matched", "sure"), [("plain", 0.0, 0.02), ("noise", 0.1, 0.02), ("other scenes", 0.05, 0.0125)]
+)
+def test_eyes_that_have_nothing_in_common_are_seldom_matched(what: str, matched: float, sure: float) -> None:
+    rng, sigma = np.random.default_rng(0), 3.0 * (what == "noise")
+    eyes = [np.rint(rng.normal(128, sigma, (HEIGHT, WIDTH, 3))).astype(np.uint8) for _ in range(2)]
+    if what == "other scenes":
+        eyes = [texture(WIDTH, seed) for seed in (1, 2)]
+    depth, confidence = StereoDepth(StereoConfig(), CAMERA, BASELINE)(make_pair(*eyes), ALL)
+    assert np.isfinite(depth).all() and np.isfinite(confidence).all()
+    assert (depth > 0).mean() <= matched and confidence.mean() < sure
 
 
 def test_depth_ends_at_the_tissue_edge_and_at_the_range() -> None:
@@ -185,78 +170,38 @@ def test_eyes_of_devices_that_are_no_endoscope_are_taken(baseline: float, max_de
     assert not StereoDepth(StereoConfig(max_depth=max_depth), CAMERA, baseline).findings
 
 
-def test_observation_carries_the_frame() -> None:
-    pair, truth = plane_pair(28.0, 0.0, 0.0)
-    confidence = np.full_like(truth, 0.5)
-    observation = observe(pair, ALL, Measured(truth, confidence))
-    assert observation.camera is pair.camera
-    assert observation.image is pair.left
-    expected = pair.left @ np.array([0.299, 0.587, 0.114])
-    np.testing.assert_allclose(observation.gray, expected, atol=1)
-    assert observation.depth is truth
-    assert observation.depth_confidence is confidence
-
-
 # ---- stereo and tissue: real recordings ------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def d4d(data_folder: Path) -> list[tuple[U8, U8, Bool, F32]]:
-    """Left, right, tissue and reference depth (m) of every 20th frame."""
+def test_depth_of_a_real_session_is_right_and_confidence_tells_good_from_bad(data_folder: Path) -> None:
     folder = data_folder / "d4d_pull"
-    frames = []
-    for index, picture in decode(folder / "2025_03_06-16_49_40_combined_2x2.mp4", every=20):
-        tool = cv2.imread(str(folder / f"toolmask/{index:04d}.png"), cv2.IMREAD_GRAYSCALE) > 127
-        depth = cv2.imread(str(folder / f"depth_mm_x100/{index:04d}.png"), cv2.IMREAD_UNCHANGED) * 1e-5
-        frames.append((picture[:540, :675], picture[:540, 675:], ~tool, depth.astype(np.float32)))
-    return frames
-
-
-def decode(video: Path, every: int) -> Iterator[tuple[int, U8]]:
-    capture = cv2.VideoCapture(str(video))
-    index = 0
-    while capture.grab():
-        if index % every == 0:
-            yield index, cv2.cvtColor(capture.retrieve()[1], cv2.COLOR_BGR2RGB)
-        index += 1
-    capture.release()
-
-
-def test_depth_of_a_real_session(d4d: list[tuple[U8, U8, Bool, F32]]) -> None:
+    video = cv2.VideoCapture(str(folder / "2025_03_06-16_49_40_combined_2x2.mp4"))
     rectifier = Rectifier(load_rig(ROOT / "calib/d4d"), 640, 512)
     find_tissue = TissueMask(TissueConfig(exclude=((0, 0, 367, 37),)), rectifier)
     stereo = StereoDepth(StereoConfig(), rectifier.camera, rectifier.baseline)
-    errors, wanted = [], 0
-    for left, right, tissue, reference in d4d:
-        frame = make_frame(left, right, tissue)
+    found, wanted = [], 0
+    for index in itertools.takewhile(lambda _: video.grab(), itertools.count()):
+        if index % 20:
+            continue
+        picture = cv2.cvtColor(video.retrieve()[1], cv2.COLOR_BGR2RGB)[:540]
+        tool = cv2.imread(str(folder / f"toolmask/{index:04d}.png"), cv2.IMREAD_GRAYSCALE) > 127
+        reference = cv2.imread(str(folder / f"depth_mm_x100/{index:04d}.png"), cv2.IMREAD_UNCHANGED) * 1e-5
+        frame = make_frame(picture[:, :675], picture[:, 675:], ~tool)
         pair = rectifier(frame)
         mask = find_tissue(frame, pair)
-        depth, _ = stereo(pair, mask)
+        depth, confidence = stereo(pair, mask)
         truth = cv2.resize(reference, (640, 512), interpolation=cv2.INTER_NEAREST)
-        errors.append(np.abs(depth - truth)[mask & (truth > 0) & (depth > 0)] * 1e3)
+        known = mask & (truth > 0) & (depth > 0)
+        found.append((np.abs(depth - truth)[known] * 1e3, confidence[known]))
         side = 2 * round(EDGE_MARGIN * 640) + 1  # so near to an instrument depth is not asked for
         inner = cv2.erode(mask.view(np.uint8), np.ones((side, side), np.uint8)) > 0
         wanted += int((inner & (truth > 0)).sum())
-    error = np.concatenate(errors)
+    error, confidence = (np.concatenate(each) for each in zip(*found, strict=True))
     assert np.median(error) < 1.05  # the reference itself is good to about 1 mm
     assert np.percentile(error, 90) < 3.6
     assert len(error) / wanted > 0.89  # the strip that the right eye does not see is 4 %
-
-
-def test_confidence_tells_good_depth_from_bad(d4d: list[tuple[U8, U8, Bool, F32]]) -> None:
-    rectifier = Rectifier(load_rig(ROOT / "calib/d4d"), 640, 512)
-    stereo = StereoDepth(StereoConfig(), rectifier.camera, rectifier.baseline)
-    errors, confidences = [], []
-    for left, right, tissue, reference in d4d:
-        depth, confidence = stereo(rectifier(make_frame(left, right)), rectifier.mask(tissue))
-        truth = cv2.resize(reference, (640, 512), interpolation=cv2.INTER_NEAREST)
-        known = (depth > 0) & (truth > 0)
-        errors.append(np.abs(depth - truth)[known])
-        confidences.append(confidence[known])
-    error, confidence = np.concatenate(errors), np.concatenate(confidences)
-    medians = [
-        np.median(error[(confidence > low) & (confidence <= low + 0.25)]) for low in (0, 0.25, 0.5, 0.75)
-    ]
+    quarters = [(confidence > low) & (confidence <= low + 0.25) for low in (0, 0.25, 0.5, 0.75)]
+    medians = [np.median(error[quarter]) for quarter in quarters]
     assert medians == sorted(medians, reverse=True)
     assert medians[0] > 3 * medians[-1]  # where it is worst, beside instruments, there is no depth at all
 
