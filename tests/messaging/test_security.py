@@ -29,12 +29,15 @@ from zmq.auth import load_certificate
 from sags_node.cli.main import main
 from sags_node.client import ClientKeys, client_keys
 from sags_node.errors import SagsError, UsageError
+from sags_node.mapping.anchors import MAX_ANCHORS
 from sags_node.messaging import control
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.peers import MAX_PEERS, Peers
+from sags_node.messaging.requests import MAX_VIEW_HZ
 from sags_node.messaging.roles import ROLES, Client, needed
 from sags_node.messaging.security import read_allow_list, read_key_pair, write_key_pair
 from sags_node.messaging.subscriber import Subscriber
+from sags_node.node.views import MAX_VIEWS
 from sags_node.processes import resident_mb
 
 pytestmark = pytest.mark.live
@@ -328,6 +331,11 @@ def test_who_needs_no_key_may_do_everything(tmp_path: Path, keys: Path, with_key
         with one.asker() as asker, Subscriber([TOPIC], run_dir=tmp_path / "run") as subscriber:
             assert asker.request("save_model") == "done"
             assert subscriber.endpoint.startswith("ipc:") and subscriber.wait(TOPIC, 30) is not None
+
+
+def test_the_limit_is_above_what_a_node_can_be_asked_for() -> None:
+    assert control.RATE > MAX_VIEWS * MAX_VIEW_HZ
+    assert control.BURST > MAX_ANCHORS + MAX_VIEWS
 
 
 def test_a_bucket_gives_its_burst_and_then_its_rate() -> None:
