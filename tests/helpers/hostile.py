@@ -1,6 +1,5 @@
 """Strangers: requests that are none, raw bytes on a port, and peers that speak ZeroMQ to do harm."""
 
-import contextlib
 import socket
 import time
 from typing import Any
@@ -48,15 +47,6 @@ def raw(endpoint: str) -> socket.socket:
     """A plain tcp connection to a ZeroMQ endpoint."""
     host, port = endpoint.removeprefix("tcp://").split(":")
     return socket.create_connection((host, int(port)), timeout=2)
-
-
-def crowd(endpoint: str, strangers: int) -> list[socket.socket]:
-    """Those of many plain connections that were not cut off before they stood."""
-    connections = []
-    for _ in range(strangers):
-        with contextlib.suppress(ConnectionError):
-            connections.append(raw(endpoint))
-    return connections
 
 
 def greet(connection: socket.socket, kind: bytes) -> None:

@@ -74,11 +74,8 @@ class Chain:
             delay = int((20 + mapped_ms + jitter.uniform(0, 30)) * MS)
             is_set = round(wall_ms * MS) if i >= 190 else 0
             at = Moment(begun.monotonic + delay, begun.wall + delay + is_set)
-            stamps = {
-                "captured": begun.wall,
-                "published": at.wall - 15 * MS - is_set,
-                "received": at.wall - 5 * MS,
-            }
+            stamps = {"captured": begun.wall, "published": at.wall - 15 * MS - is_set}
+            stamps["received"] = at.wall - 5 * MS
             number = None if i % 11 == 0 else (i + NUMBERS - 50) % NUMBERS
             self.ledger.seen(number, stamps, at)
             if number is not None:
@@ -160,9 +157,7 @@ def measuring(
 
 
 @pytest.mark.live
-def test_a_chain_of_sockets_that_holds_pictures_is_at_least_so_slow(
-    phantom_session: Path, tmp_path: Path
-) -> None:
+def test_a_chain_that_holds_pictures_is_so_slow(phantom_session: Path, tmp_path: Path) -> None:
     """By its own stamps: no image leaves before `HELD` after its capture."""
     source = PushedPictures(PushSource(endpoint="tcp://127.0.0.1:*"), (320, 256))
     with publisher(tmp_path / "run") as node, source:
@@ -174,8 +169,7 @@ def test_a_chain_of_sockets_that_holds_pictures_is_at_least_so_slow(
     assert found["unknown"] == found["unreadable"] == found["clock_set"] == 0
     # Its stamp is that of the sending.
     assert found["parts_ms"]["captured"]["max"] == pytest.approx(0, abs=0.1)
-    assert found["parts_ms"]["published"]["p50"] >= 1e3 * HELD
-    assert found["total_ms"]["p50"] >= 1e3 * HELD
+    assert min(spread["p50"] for spread in (found["parts_ms"]["published"], found["total_ms"])) >= 1e3 * HELD
     assert found["total_ms"]["max"] >= found["parts_ms"]["published"]["max"]
 
 
@@ -214,11 +208,9 @@ def test_an_overlay_ten_pictures_behind_is_measured(tmp_path: Path) -> None:
     def measured() -> dict[str, Any] | None:
         """Where this process stood still most images are lost, and it is measured again."""
         codes, ended = Painted(), threading.Event()
-        with (
-            overlaid(tmp_path, 10, codes) as overlay,
-            measuring(codes, tmp_path, ended.set, overlay) as found,
-        ):
-            until(ended.is_set)
+        with overlaid(tmp_path, 10, codes) as overlay:
+            with measuring(codes, tmp_path, ended.set, overlay) as found:
+                until(ended.is_set)
         return found if found["read"] > found["lost"] else None
 
     found = until(measured)
@@ -245,19 +237,17 @@ def test_an_overlay_that_is_behind_all_pictures_is_named(tmp_path: Path) -> None
 @pytest.mark.alone
 def test_a_camera_that_films_the_page_closes_the_circle(tmp_path: Path) -> None:
     """Screenshots are what the camera sees; they are published `HELD` later."""
-    codes, ended, run_dir = Page(0), threading.Event(), tmp_path / "run"
-    with (
-        new_page(viewport={"width": 400, "height": 400}) as display,
-        publisher(run_dir) as node,
-        measuring(codes, run_dir, ended.set) as found,
-    ):
-        display.goto(codes.address)
-        for number in itertools.count():
-            if ended.is_set():
-                break
-            shot = cv2.imdecode(np.frombuffer(display.screenshot(), np.uint8), cv2.IMREAD_COLOR)
-            show_late(node, shot[..., ::-1].copy(), time.time_ns(), number)
-        until(lambda: "ended" in display.inner_text("#said"))
+    ended, run_dir = threading.Event(), tmp_path / "run"
+    with new_page(viewport={"width": 400, "height": 400}) as display, publisher(run_dir) as node:
+        codes = Page(0)  # serves from now on until it was measured
+        with measuring(codes, run_dir, ended.set) as found:
+            display.goto(codes.address)
+            for number in itertools.count():
+                if ended.is_set():
+                    break
+                shot = cv2.imdecode(np.frombuffer(display.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+                show_late(node, shot[..., ::-1].copy(), time.time_ns(), number)
+            until(lambda: "ended" in display.inner_text("#said"))
     assert found["from"] == "displayed" and found["read"] > 0 and found["unknown"] == 0
     assert found["parts_ms"]["published"]["p50"] >= 1e3 * HELD
     assert found["total_ms"]["p50"] >= 1e3 * HELD
@@ -267,32 +257,24 @@ def test_a_camera_that_films_the_page_closes_the_circle(tmp_path: Path) -> None:
 @pytest.mark.live
 def test_only_the_page_itself_says_what_is_shown() -> None:
     """Else any page that is open in the browser could; and the newest page is the one that counts."""
+    good = '{"page": 1e12, "number": 5, "shown_ms": 100.0, "now_ms": 104.5}'
     with Page(0) as page:
-
-        def post(said: str, origin: str, host: str | None = None) -> int:
-            request = urllib.request.Request(f"{page.address}shown", said.encode(), {"Origin": origin})
-            if host is not None:
-                request.add_header("Host", host)
+        own = page.address.rstrip("/")
+        wrong = ("", "[]", good.replace("5,", "1000,"), good.replace("100.0", "1e300"), good + " " * 2000)
+        for said, headers, status in (
+            (good, {"Origin": own}, 200),
+            (good, {"Origin": "http://elsewhere.example"}, 409),
+            (good, {"Origin": "http://elsewhere.example", "Host": "elsewhere.example"}, 409),
+            *((each, {"Origin": own}, 400) for each in wrong),
+            (good.replace("1e12", "2e12"), {"Origin": own}, 200),
+            (good, {"Origin": own}, 409),
+        ):
+            request = urllib.request.Request(f"{page.address}shown", said.encode(), headers)
             try:
                 with urllib.request.urlopen(request, timeout=60) as answer:
-                    return int(answer.status)
+                    came = answer.status
             except urllib.error.HTTPError as error:
-                return error.code
-
-        own = page.address.rstrip("/")
-        good = '{"page": 1e12, "number": 5, "shown_ms": 100.0, "now_ms": 104.5}'
-        assert post(good, own) == 200
-        assert post(good, "http://elsewhere.example") == 409
-        assert post(good, "http://elsewhere.example", host="elsewhere.example") == 409
-        for wrong in (
-            "",
-            "[]",
-            good.replace("5,", "1000,"),
-            good.replace("100.0", "1e300"),
-            good + " " * 2000,
-        ):
-            assert post(wrong, own) == 400
-        assert post(good.replace("1e12", "2e12"), own) == 200
-        assert post(good, own) == 409
+                came = error.code
+            assert came == status, (said, headers)
         figures = page.ledger.figures(Moment(0, 0), Moment.now())
         assert (figures["codes"], figures["read"]) == (2, 0)

@@ -1,9 +1,8 @@
 """Requests to the node over a real socket, sane and insane."""
 
-import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import pytest
 import zmq
 from ports import free_port
 from synthetic import publisher
-from waiting import beside, repeating, until
+from waiting import repeating, until
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.control import MAX_PENDING, ControlClient, Handler
@@ -37,6 +36,7 @@ def node(run_dir: Path, handlers: dict[str, Handler]) -> Iterator[str]:
 
 
 def test_results_and_errors_come_back(tmp_path: Path) -> None:
+    """Also to a client without our code."""
     handlers: dict[str, Handler] = {
         "double": lambda args: {"twice": args["x"] * 2},
         "refuse": refuse,
@@ -46,22 +46,17 @@ def test_results_and_errors_come_back(tmp_path: Path) -> None:
     with node(tmp_path / "run", handlers) as endpoint, ControlClient(endpoint) as asker:
         assert asker.request("ping") == "pong"
         assert asker.request("double", {"x": 21}) == {"twice": 42}
-        with pytest.raises(SagsError, match=r"refuse: mapping\.nothing cannot be changed"):
-            asker.request("refuse")
-        with pytest.raises(SagsError, match="KeyError"):
-            asker.request("broken")
-        with pytest.raises(SagsError, match="internal error"):
-            asker.request("unsendable")
-        with pytest.raises(SagsError, match=r"unknown op 'doubel'.*double"):
-            asker.request("doubel")
+        for op, said in (
+            ("refuse", r"refuse: mapping\.nothing cannot be changed"),
+            ("broken", "KeyError"),
+            ("unsendable", "internal error"),
+            ("doubel", r"unknown op 'doubel'.*double"),
+        ):
+            with pytest.raises(SagsError, match=said):
+                asker.request(op)
         for unsendable in (2**70, "\udcff", object()):
             with pytest.raises(UsageError, match="ping: what is asked cannot be sent"):
                 asker.request("ping", {"x": unsendable})
-        assert asker.request("ping") == "pong"
-
-
-def test_a_client_without_our_code_is_answered(tmp_path: Path) -> None:
-    with node(tmp_path / "run", {"refuse": refuse}) as endpoint:
         assert client.request(endpoint, "ping", {}) == {"v": "1.0", "id": 7, "ok": True, "result": "pong"}
         reply = client.request(endpoint, "refuse", {})
         assert reply["ok"] is False and "cannot be changed" in reply["error"]
@@ -75,21 +70,22 @@ def test_a_future_is_answered_when_it_is_done_and_others_meanwhile(tmp_path: Pat
         waiting[-1].set_running_or_notify_cancel()  # it has begun
         return waiting[-1]
 
-    with node(tmp_path / "run", {"later": later}) as endpoint:
-        with ControlClient(endpoint) as slow, ControlClient(endpoint) as quick:
-            answers: list[Any] = []
-            with beside(lambda: answers.append(slow.request("later", timeout=30))):
-                until(lambda: waiting)
-                assert quick.request("ping") == "pong"
-                assert answers == []
-                waiting[0].set_result({"done": True})
-            assert answers == [{"done": True}]
-            waiting.clear()
-            with pytest.raises(SagsError, match="no answer"):
-                slow.request("later", timeout=0.05)
-            until(lambda: waiting)
-            waiting[0].set_exception(SagsError("too late"))
-            assert slow.request("ping") == "pong"  # the late answer is not taken for this one
+    with (
+        node(tmp_path / "run", {"later": later}) as endpoint,
+        ControlClient(endpoint) as slow,
+        ControlClient(endpoint) as quick,
+        ThreadPoolExecutor() as pool,
+    ):
+        answer = pool.submit(slow.request, "later", timeout=30)
+        until(lambda: waiting)
+        assert quick.request("ping") == "pong" and not answer.done()
+        waiting.pop().set_result({"done": True})
+        assert answer.result(30) == {"done": True}
+        with pytest.raises(SagsError, match="no answer"):
+            slow.request("later", timeout=0.05)
+        until(lambda: waiting)
+        waiting[0].set_exception(SagsError("too late"))
+        assert slow.request("ping") == "pong"  # the late answer is not taken for this one
 
 
 @pytest.mark.fault("socket: more requests than may wait")
@@ -142,12 +138,11 @@ def test_a_node_that_stopped_in_order_is_waited_for(tmp_path: Path) -> None:
     with asker:
         with pytest.raises(SagsError, match="no node runs as 'sags'"):
             asker.request("ping", timeout=0.3)
-        answers: list[Any] = []
-        with beside(lambda: answers.append(asker.request("mark", timeout=30))):
+        with ThreadPoolExecutor() as pool:
+            answer = pool.submit(asker.request, "mark", timeout=30)
             time.sleep(0.3)
             with node(tmp_path / "run", {"mark": lambda args: asked.append("x")}) as endpoint:
-                until(lambda: answers)
-                assert answers == [None] and asked == ["x"]  # once
+                assert answer.result(60) is None and asked == ["x"]  # once
                 assert asker.endpoint == endpoint
 
 
@@ -160,25 +155,17 @@ def test_what_may_have_been_done_is_not_asked_for_again(tmp_path: Path) -> None:
         asked.append("first")
         return Future()
 
-    with node(tmp_path / "run", {"mark": never}):
-        asker = ControlClient(run_dir=tmp_path / "run")
-        errors: list[str] = []
-
-        def ask() -> None:
-            try:
-                asker.request("mark", timeout=30)
-            except SagsError as error:
-                errors.append(str(error))
-
-        thread = threading.Thread(target=ask)
-        thread.start()
-        until(lambda: asked)
-    with asker, node(tmp_path / "run", {"mark": lambda args: asked.append("second")}):
-        thread.join(30)
-        assert len(errors) == 1 and "started anew before it answered; ask again" in errors[0]
-        assert asked == ["first"]
-        asker.request("mark", timeout=30)
-        assert asked == ["first", "second"]
+    with ThreadPoolExecutor() as pool:
+        with node(tmp_path / "run", {"mark": never}):
+            asker = ControlClient(run_dir=tmp_path / "run")
+            answer = pool.submit(asker.request, "mark", timeout=30)
+            until(lambda: asked)
+        with asker, node(tmp_path / "run", {"mark": lambda args: asked.append("second")}):
+            with pytest.raises(SagsError, match="started anew before it answered; ask again"):
+                answer.result(60)
+            assert asked == ["first"]
+            asker.request("mark", timeout=30)
+            assert asked == ["first", "second"]
 
 
 def test_an_endpoint_that_was_given_is_kept(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ import resource
 import shlex
 import shutil
 import stat
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import publisher as publishing
 from sags_node.messaging.publisher import Publisher
-from sags_node.messaging.rundir import RunDirectory, connection_path, read_connection
+from sags_node.messaging.rundir import RunDirectory, read_connection
 from sags_node.messaging.subscriber import Subscriber
 
 pytestmark = pytest.mark.live
@@ -34,7 +33,7 @@ def test_run_directory_and_connection_file_are_private(tmp_path: Path) -> None:
     with publisher(run_dir) as running:
         file = run_dir / "sags.json"
         assert stat.S_IMODE(run_dir.stat().st_mode) == 0o700
-        assert stat.S_IMODE(file.stat().st_mode) == 0o600
+        assert all(stat.S_IMODE(each.stat().st_mode) == 0o600 for each in (file, run_dir / "sags.ipc"))
         said = json.loads(file.read_text())
         assert said["pid"] == os.getpid() and said["protocol"] == "1.0" and said["ns"] == "sags"
         assert said["public_key"] is None and said["session"] == "session-1"
@@ -128,9 +127,7 @@ def test_one_name_one_node(tmp_path: Path) -> None:
 
 
 @pytest.mark.fault("process: it may open fewer files than its clients need")
-def test_a_limit_of_files_that_clients_may_reach_is_told(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_low_limit_of_files_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     try:
         resource.setrlimit(resource.RLIMIT_NOFILE, (publishing.ENOUGH_FILES - 1, before[1]))
@@ -143,19 +140,17 @@ def test_a_limit_of_files_that_clients_may_reach_is_told(
         resource.setrlimit(resource.RLIMIT_NOFILE, before)
 
 
-def test_an_open_run_directory_is_refused(tmp_path: Path) -> None:
+def test_a_run_directory_that_is_open_a_link_or_too_long_is_refused(tmp_path: Path) -> None:
     tmp_path.chmod(0o755)
-    with pytest.raises(UsageError, match="chmod 700"), publisher(tmp_path):
-        pass
     (tmp_path / "real").mkdir(mode=0o700)
     (tmp_path / "link").symlink_to(tmp_path / "real")
-    with pytest.raises(UsageError, match="not a directory of yours"), publisher(tmp_path / "link"):
-        pass
-
-
-def test_a_long_run_directory_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="too long"), publisher(tmp_path / ("x" * 100)):
-        pass
+    for run_dir, said in (
+        (tmp_path, "chmod 700"),
+        (tmp_path / "link", "not a directory of yours"),
+        (tmp_path / ("x" * 100), "too long"),
+    ):
+        with pytest.raises(UsageError, match=said), publisher(run_dir):
+            pass
 
 
 def test_no_control_socket(tmp_path: Path) -> None:
@@ -168,34 +163,21 @@ def test_no_control_socket(tmp_path: Path) -> None:
 # ---- the run directory of a node that runs: whatever becomes of it, the node is found again ------------
 
 
-Remove = Callable[[Path], object]
-
-
 @pytest.fixture(autouse=True)
 def looks_often(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(publishing, "LOOK_SECONDS", 0.02)
 
 
-def the_directory(run_dir: Path) -> None:
-    """At once: while it is emptied, the node would put its file back."""
-    shutil.rmtree(run_dir.rename(run_dir.with_name("gone")))
-
-
-def the_connection_file(run_dir: Path) -> None:
-    connection_path(run_dir, "sags").unlink()
-
-
-def the_socket(run_dir: Path) -> None:
-    (run_dir / "sags.ipc").unlink()
-
-
 @pytest.mark.fault("run directory: it, its file or its socket is removed")
-@pytest.mark.parametrize("remove", [the_directory, the_connection_file, the_socket])
-def test_what_is_removed_comes_back(remove: Remove, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize("what", [".", "sags.json", "sags.ipc"], ids=["directory", "file", "socket"])
+def test_what_is_removed_comes_back(what: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     run_dir = tmp_path / "run"
     with publisher(run_dir) as running, stream(running), Subscriber(["tf"], run_dir=run_dir) as old:
         assert old.endpoint.startswith("ipc:") and old.wait("tf", 30) is not None
-        remove(run_dir)
+        if what == ".":  # at once: while it is emptied, the node would put its file back
+            shutil.rmtree(run_dir.rename(tmp_path / "gone"))
+        else:
+            (run_dir / what).unlink()
         until(lambda: "is there again" in caplog.text)
         assert read_connection("sags", run_dir) == running.connection
         assert run_dir.stat().st_mode & 0o777 == 0o700
@@ -209,9 +191,7 @@ def test_what_is_removed_comes_back(remove: Remove, tmp_path: Path, caplog: pyte
 
 
 @pytest.mark.fault("run directory: another node has taken the place")
-def test_the_place_that_another_node_has_taken_is_left_to_it(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_place_that_was_taken_is_left(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     run_dir = tmp_path / "run"
     with ExitStack() as meanwhile:
         with publisher(run_dir, ipc=False) as first:
@@ -239,9 +219,7 @@ def test_a_directory_that_is_open_to_others_is_not_used(
         until(lambda: running.poll(10) or (run_dir / "sags.json").exists())
 
 
-def test_the_socket_of_a_relative_run_directory_is_found_from_anywhere(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_relative_run_directory_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     place = RunDirectory(Path("run"), "sags")
     try:

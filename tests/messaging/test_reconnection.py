@@ -5,7 +5,6 @@ import sys
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-import msgspec
 import pytest
 from cable import Cable
 from command_line import killed
@@ -24,7 +23,7 @@ pytestmark = pytest.mark.live
 
 
 def _node(
-    run_dir: Path, session: str, port: int, ipc: bool = False
+    run_dir: Path, session: str, port: int, ipc: bool
 ) -> AbstractContextManager[subprocess.Popen[bytes]]:
     """A publisher in its own process, which ends with SIGKILL and so leaves its files behind."""
     program = (
@@ -39,30 +38,31 @@ def _node(
 
 
 @pytest.mark.fault("process: the node is killed, another begins in its place")
-@pytest.mark.parametrize(
-    ("by_file", "ipc", "moves"),
-    [(False, False, False), (True, True, False), (True, False, True)],
-    ids=["same port", "ipc", "another port"],
-)
-def test_a_killed_node_is_followed(tmp_path: Path, by_file: bool, ipc: bool, moves: bool) -> None:
+def test_a_killed_node_is_followed(tmp_path: Path) -> None:
+    """To the same port, to the same ipc socket, and to another port by who has it from the file."""
     run_dir, port = tmp_path / "run", free_port()
-    where = {} if by_file else {"endpoint": f"tcp://127.0.0.1:{port}"}
-    with _node(run_dir, "first", port, ipc):
+    with _node(run_dir, "first", port, ipc=True):
         until((run_dir / "sags.json").exists)
-        subscriber, asker = Subscriber(["tf"], run_dir=run_dir, **where), ControlClient(run_dir=run_dir)
-        found = subscriber.wait("tf", 30)
-        assert found is not None and found.meta.session == asker.request("who", timeout=30) == "first"
-    with subscriber, asker:
-        until(lambda: not subscriber.ok("tf"))
-        before, asked = subscriber.endpoint, asker.endpoint
-        with pytest.raises(SagsError, match=f"no answer from {asked} in 0.3 s"):
-            asker.request("who", timeout=0.3)
-        with _node(run_dir, "second", free_port() if moves else port, ipc):
-            until(lambda: (newest := subscriber.latest("tf")) is not None and newest.meta.session == "second")
-            until(lambda: subscriber.ok("tf"))
-            assert asker.request("who", timeout=30) == "second" and asker.endpoint != asked
-        assert (subscriber.endpoint != before) == moves
-        assert subscriber.lost("tf") == 0
+        by_port, by_file = (
+            Subscriber(["tf"], run_dir=run_dir, endpoint=end) for end in (f"tcp://127.0.0.1:{port}", None)
+        )
+        asker = ControlClient(run_dir=run_dir)
+        for subscriber in (by_port, by_file):
+            found = subscriber.wait("tf", 30)
+            assert found is not None and found.meta.session == asker.request("who", timeout=30) == "first"
+    with by_port, by_file, asker:
+        for session, ipc, following in (("second", True, (by_port, by_file)), ("third", False, (by_file,))):
+            until(lambda following=following: not any(each.ok("tf") for each in following))
+            before, asked = [each.endpoint for each in following], asker.endpoint
+            with pytest.raises(SagsError, match=f"no answer from {asked} in 0.3 s"):
+                asker.request("who", timeout=0.3)
+            with _node(run_dir, session, port if ipc else free_port(), ipc):
+                for each in following:
+                    until(lambda each=each, session=session: each.latest("tf").meta.session == session)
+                    until(lambda each=each: each.ok("tf"))
+                    assert each.lost("tf") == 0
+                assert asker.request("who", timeout=30) == session and asker.endpoint != asked
+                assert ([each.endpoint for each in following] == before) == ipc
 
 
 def _answers(asker: ControlClient) -> bool:
@@ -73,9 +73,7 @@ def _answers(asker: ControlClient) -> bool:
 
 
 @pytest.mark.fault("socket: the cable is cut, that of requests too")
-def test_a_connection_that_died_without_a_word_is_made_anew(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_silent_connection_is_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine that lost its power closes nothing: only a missing heartbeat tells."""
     monkeypatch.setattr(address, "HEARTBEAT_MS", 100)
     monkeypatch.setattr(address, "HEARTBEAT_TIMEOUT_MS", 300)
@@ -95,20 +93,8 @@ def test_a_connection_that_died_without_a_word_is_made_anew(
             assert cable.connections == 2
 
 
-def test_a_node_that_wants_keys_after_its_restart_says_so(tmp_path: Path) -> None:
-    run_dir = tmp_path / "run"
-    with publisher(run_dir, ipc=False) as running:
-        known = running.connection
-        subscriber, asker = Subscriber(["tf"], run_dir=run_dir), ControlClient(run_dir=run_dir)
-    with subscriber, asker:
-        with_keys = msgspec.json.encode(msgspec.structs.replace(known, public_key="k" * 40))
-        (run_dir / "sags.json").write_bytes(with_keys)
-        until(lambda: "wants a key" in str(subscriber.problem("tf")))
-        with pytest.raises(UsageError, match="wants a key"):
-            asker.request("ping")
-
-
-def test_a_subscriber_that_may_begin_before_its_node_says_what_is_missing(tmp_path: Path) -> None:
+def test_a_client_says_why_it_has_no_node_whatever_becomes_of_it(tmp_path: Path) -> None:
+    """There is none yet, it wants a key, it does not, it has ended, and the next one wants a key again."""
     run_dir, keys = tmp_path / "run", make_keys(tmp_path / "keys")
     with Subscriber(["tf"], run_dir=run_dir, may_be_absent=True) as subscriber:
         assert "no node runs as 'sags'" in str(subscriber.problem("tf")) and not subscriber.endpoint
@@ -117,6 +103,12 @@ def test_a_subscriber_that_may_begin_before_its_node_says_what_is_missing(tmp_pa
         with node(run_dir):
             until(lambda: subscriber.ok("tf"))
             assert subscriber.refusal is None
+            asker = ControlClient(run_dir=run_dir)
+            assert asker.request("ping") == "pong"
         until(lambda: "no node runs as 'sags'" in str(subscriber.problem("tf")))
-        with node(run_dir, keys, ipc=False), pytest.raises(UsageError, match="wants a key"):
-            Subscriber(["tf"], run_dir=run_dir, may_be_absent=True)
+        with asker, node(run_dir, keys, ipc=False):
+            until(lambda: "wants a key" in str(subscriber.problem("tf")))
+            with pytest.raises(UsageError, match="wants a key"):
+                asker.request("ping")
+            with pytest.raises(UsageError, match="wants a key"):
+                Subscriber(["tf"], run_dir=run_dir, may_be_absent=True)

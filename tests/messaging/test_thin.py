@@ -1,6 +1,6 @@
 """Thin images over real sockets: what comes, how large and exact it is, and what wrong requests hear."""
 
-from concurrent.futures import ThreadPoolExecutor
+import itertools
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -98,11 +98,8 @@ def test_pictures_masks_and_confidence_come_as_they_are(tmp_path: Path) -> None:
         said = frame_of(running, *names.values(), IMAGE, SURE, MASK)
     rgba = said[IMAGE].astype(np.float32)
     black = rgba[..., :3] * rgba[..., 3:] / 255
-    for name, expected in (
-        ("camera", result.pair.left),
-        ("right", smaller(result.pair.right, 2)),
-        ("drawn", smaller(black, 2)),
-    ):
+    halves = {"right": smaller(result.pair.right, 2), "drawn": smaller(black, 2)}
+    for name, expected in {"camera": result.pair.left, **halves}.items():
         came = said[names[name]]
         assert came.shape == expected.shape and came.dtype == np.uint8
         beside = came.astype(np.float32) - expected
@@ -113,11 +110,14 @@ def test_pictures_masks_and_confidence_come_as_they_are(tmp_path: Path) -> None:
     assert np.array_equal(said[names["mask"]], said[MASK][4:64:4, 8:88:4])
 
 
-def test_another_language_finds_file_scale_and_place(tmp_path: Path) -> None:
-    """docs/wire.md alone: the file is part 1; `scale` and `window` are in the header."""
+def test_another_language_and_sags_topic_read_them(tmp_path: Path) -> None:
+    """By docs/wire.md alone: the file is part 1; `scale` and `window` are in the header."""
     name = "thin/half/10,20,30,24/left/render/depth/png"
     with node_sockets(tmp_path) as running, making(running, plane_result()):
+        node = NodeAddress(endpoint=running.connection.data[-1])
         (message,) = collect(running.connection.data[-1], [name], 1, 60)[name]
+        (said,) = topic_echo("thin/half/left/depth/png", node, count=1, seconds=60)
+        assert heard(partial(topic_figures, "hz", "thin/half/left/depth/png", node))["window"] >= 2
     assert message.meta["type"] == "sensor_msgs/msg/CompressedImage"
     assert message.meta["window"] == [10, 20, 2] and message.meta["scale"] == DEPTH_STEP
     stored = cv2.imdecode(np.frombuffer(message.parts[1], np.uint8), cv2.IMREAD_UNCHANGED)
@@ -125,6 +125,10 @@ def test_another_language_finds_file_scale_and_place(tmp_path: Path) -> None:
     store_reads = content.cdr.decode(message.cdr(), message.meta["type"])
     assert bytes(store_reads.data) == message.parts[1] and store_reads.format == message.meta["encoding"]
     assert store_reads.format == "16UC1; png compressed 16UC1"
+    depth = plane_result().observation.depth[::2, ::2]
+    assert said["content"]["shape"] == list(depth.shape)
+    assert said["content"]["max"] == pytest.approx(depth.max(), abs=DEPTH_STEP)
+    assert said["content"]["unknown"] == pytest.approx(np.mean(depth == 0))
 
 
 def test_nothing_is_made_that_nobody_asks_for_by_its_name(tmp_path: Path) -> None:
@@ -141,32 +145,16 @@ def test_nothing_is_made_that_nobody_asks_for_by_its_name(tmp_path: Path) -> Non
             assert {asked for frame in made for asked in frame} == {name}
 
 
-def test_sags_topic_reads_them_like_the_whole(tmp_path: Path) -> None:
-    depth = plane_result().observation.depth[::2, ::2]
-    with node_sockets(tmp_path) as running, making(running, plane_result()):
-        node = NodeAddress(endpoint=running.connection.data[-1])
-        (said,) = topic_echo("thin/half/left/depth/png", node, count=1, seconds=60)
-        figures = heard(partial(topic_figures, "hz", "thin/half/left/depth/png", node))
-        assert figures["window"] >= 2
-    assert said["content"]["shape"] == list(depth.shape)
-    assert said["content"]["max"] == pytest.approx(depth.max(), abs=DEPTH_STEP)
-    assert said["content"]["unknown"] == pytest.approx(np.mean(depth == 0))
-
-
 def test_a_recording_of_everything_leaves_out_what_others_asked_for(tmp_path: Path) -> None:
     """It has the whole images."""
     name = thin_name("thin/quarter/left/depth/png")
     with node_sockets(tmp_path) as running, making(running, plane_result()):
-        recorder = Recorder(
-            RecordOptions(tmp_path / "bag", node=NodeAddress(endpoint=running.connection.data[-1]))
-        )
-        with Subscriber([name], running.connection.data[-1]) as one, ThreadPoolExecutor(1) as worker:
-            recording = worker.submit(recorder.run)
-            until(lambda: list((tmp_path / "bag").glob("*.mcap")))
+        endpoint = running.connection.data[-1]
+        options = RecordOptions(tmp_path / "bag", node=NodeAddress(endpoint=endpoint))
+        with Subscriber([name], endpoint) as one, recording(options) as (_, summaries):
             for _ in range(5):
                 assert one.wait(name, 60, after=one.latest(name)) is not None
-            recorder.stop()
-            written = recording.result(60)["topics"]
+    written = summaries[-1]["topics"]
     assert "sags/left/depth" in written and not [each for each in written if "/thin/" in each]
 
 
@@ -255,16 +243,12 @@ def test_no_more_are_made_than_may_be(tmp_path: Path) -> None:
 
 
 def test_no_name_begins_with_another() -> None:
-    names = [
-        f"thin/{size}/{region}{topic}/{form}"
-        for size in ("full", "half", "quarter")
-        for region in ("", "1,2,3,4/", "1,2,3,40/")
-        for topic, forms in topics.THIN_FORMS.items()
-        for form in forms
-    ] + list(topics.BY_NAME)
-    assert [
-        (a, b) for a in names for b in names if a != b and a.startswith(b) and a.startswith("thin/")
-    ] == []
+    forms = [f"{name}/{form}" for name, forms in topics.THIN_FORMS.items() for form in forms]
+    parts = itertools.product(("full", "half", "quarter"), ("", "1,2,3,4/", "1,2,3,40/"), forms)
+    thin = [f"thin/{size}/{region}{form}" for size, region, form in parts]
+    for one, other in itertools.permutations(thin, 2):
+        assert not one.startswith(other)
+    assert not [name for name in topics.BY_NAME if name.startswith("thin/")]
 
 
 @pytest.mark.fault("memory: none is left for a thin image")

@@ -69,25 +69,24 @@ def test_what_is_no_bag(tmp_path: Path) -> None:
         file.write_bytes(np.random.default_rng(0).bytes(5000))
         with pytest.raises(SagsError, match=f"{name} is damaged"):
             bag_info(file)
-    with pytest.raises(UsageError, match="does not exist"):
-        bag_info(tmp_path / "nowhere.mcap")
-    with pytest.raises(UsageError, match=r"neither metadata\.yaml nor a \.mcap"):
-        bag_info(tmp_path.parent)
+    (tmp_path / "two").mkdir()
     for name in ("a_0.mcap", "a_1.mcap", "b_0.db3"):
-        (tmp_path / "two" / name).parent.mkdir(exist_ok=True)
         (tmp_path / "two" / name).touch()
-    with pytest.raises(UsageError, match=r"holds 2 recordings .*: a, b; give one of its files"):
-        bag_info(tmp_path / "two")
-    for text, said in [
+    for path, said in (
+        (tmp_path / "nowhere.mcap", "does not exist"),
+        (tmp_path.parent, r"neither metadata\.yaml nor a \.mcap"),
+        (tmp_path / "two", r"holds 2 recordings .*: a, b; give one of its files"),
+    ):
+        with pytest.raises(UsageError, match=said):
+            bag_info(path)
+    of_bag = "rosbag2_bagfile_information: {relative_file_paths: %s}"
+    for text, said in (
         ("[", "not valid YAML"),
         ("a: 1", "rosbag2_bagfile_information"),
-        ("rosbag2_bagfile_information: {relative_file_paths: 3}", "names no files"),
-        (
-            "rosbag2_bagfile_information: {relative_file_paths: [../../etc/passwd]}",
-            "names passwd, which is not",
-        ),
-        ("rosbag2_bagfile_information: {relative_file_paths: [a.mcap], compression_mode: file}", "zstd -d"),
-    ]:
+        (of_bag % "3", "names no files"),
+        (of_bag % "[../../etc/passwd]", "names passwd, which is not"),
+        (of_bag % "[a.mcap], compression_mode: file", "zstd -d"),
+    ):
         (tmp_path / "metadata.yaml").write_text(text)
         with pytest.raises(UsageError, match=said):
             bag_info(tmp_path)

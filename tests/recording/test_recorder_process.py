@@ -11,6 +11,7 @@ from synthetic import publisher, stream
 from waiting import until
 
 from benchmarks.node.processes import children
+from sags_node.clients.recording.info import bag_info
 from sags_node.errors import SagsError
 from sags_node.findings import Finding, by_stage
 from sags_node.messaging.content import health_answer
@@ -62,19 +63,34 @@ def test_a_folder_that_nobody_can_be_told_of_is_refused(
 
 
 @pytest.mark.fault("process: the recorder hangs")
+@pytest.mark.fault("process: the recorder is late with a snapshot")
 @pytest.mark.fault("process: the recorder hangs while the node stops")
 def test_a_recorder_that_does_not_answer_is_ended(
     recorder: RecorderProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As on a disk that hangs: every request is answered, the next recording begins, and a node can end."""
-    args = {"path": str(tmp_path / "ring"), "snapshot_seconds": 5}
-    recorder.start(args).result(ANSWER)
+    """As on a disk that hangs: every request is answered, a late snapshot is not taken for the next one, the
+    next recording begins, and a node can end."""
+    recorder.start({"path": str(tmp_path / "ring"), "snapshot_seconds": 5}).result(ANSWER)
     (process,) = recorders()
     os.kill(process, signal.SIGSTOP)
-    monkeypatch.setattr(child, "SNAPSHOT_SECONDS", 0.2)
-    monkeypatch.setattr(child, "FINISH_SECONDS", 0.2)
-    with pytest.raises(SagsError, match="no snapshot came from the recorder"):
+    with monkeypatch.context() as patched:
+        patched.setattr(child, "SNAPSHOT_SECONDS", 0.2)
+        with pytest.raises(SagsError, match="no snapshot came from the recorder"):
+            recorder.snapshot().result(ANSWER)
+    with pytest.raises(SagsError, match="still writes the snapshot before; ask again later"):
         recorder.snapshot().result(ANSWER)
+    os.kill(process, signal.SIGCONT)
+
+    def next_one() -> dict[str, object] | None:
+        try:
+            return recorder.snapshot().result(ANSWER)
+        except SagsError as error:
+            assert "still writes" in str(error)
+            return None
+
+    assert until(next_one)["snapshot"] == str(tmp_path / "ring/snapshot_001")
+    os.kill(process, signal.SIGSTOP)
+    monkeypatch.setattr(child, "FINISH_SECONDS", 0.2)
     with pytest.raises(SagsError, match=r"did not finish in 0\.2 s.*sags bag recover"):
         recorder.stop().result(ANSWER)
     assert recorders() == []
@@ -114,51 +130,27 @@ def test_a_recording_that_has_ended_by_itself_is_told(recorder: RecorderProcess,
     assert recorder.status() is None
 
 
-def test_a_ring_takes_the_next_free_name_and_outlives_a_snapshot_that_fails(
-    recorder: RecorderProcess, tmp_path: Path
-) -> None:
+def test_a_ring_outlives_a_snapshot_that_fails(recorder: RecorderProcess, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(SagsError, match="cannot write"):
         recorder.start({"path": str(tmp_path / "file"), "snapshot_seconds": 5}).result(ANSWER)
     ring = tmp_path / "ring"
     (ring / "snapshot_000").mkdir(parents=True)
     (ring / "snapshot_000/of_yesterday").touch()
-    recorder.start({"path": str(ring), "snapshot_seconds": 50}).result(ANSWER)
+    recorder.start({"path": str(ring), "snapshot_seconds": 50, "max_bag_size": 300_000}).result(ANSWER)
     ring.rename(tmp_path / "away")
     ring.touch()
     with pytest.raises(SagsError, match="cannot write"):
         recorder.snapshot().result(ANSWER)
     ring.unlink()
     (tmp_path / "away").rename(ring)
+    until(lambda: (recorder.status().get("kept_s") or 0) > 0.2)  # more than one file holds
     taken = recorder.snapshot().result(ANSWER)
-    assert taken["snapshot"] == str(ring / "snapshot_001") and taken["messages"] > 0
+    assert taken["snapshot"] == str(ring / "snapshot_001")
+    saved = bag_info(ring / "snapshot_001")
+    assert saved["messages"] == taken["messages"] > 0 and len(saved["files"]) > 1
     assert (ring / "snapshot_000/of_yesterday").exists()
-    recorder.stop().result(ANSWER)
-
-
-@pytest.mark.fault("process: the recorder is late with a snapshot")
-def test_a_late_snapshot_is_not_taken_for_the_next_one(
-    recorder: RecorderProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recorder.start({"path": str(tmp_path / "ring"), "snapshot_seconds": 5}).result(ANSWER)
-    (process,) = recorders()
-    os.kill(process, signal.SIGSTOP)
-    with monkeypatch.context() as patched:
-        patched.setattr(child, "SNAPSHOT_SECONDS", 0.2)
-        with pytest.raises(SagsError, match="no snapshot came from the recorder"):
-            recorder.snapshot().result(ANSWER)
-    with pytest.raises(SagsError, match="still writes the snapshot before; ask again later"):
-        recorder.snapshot().result(ANSWER)
-    os.kill(process, signal.SIGCONT)
-
-    def next_one() -> dict[str, object] | None:
-        try:
-            return recorder.snapshot().result(ANSWER)
-        except SagsError as error:
-            assert "still writes" in str(error)
-            return None
-
-    assert until(next_one)["snapshot"] == str(tmp_path / "ring/snapshot_001")
+    assert recorder.stop().result(ANSWER)["messages"] == taken["messages"]
 
 
 @pytest.mark.fault("process: the recorder does not begin")

@@ -1,7 +1,7 @@
 """What a recorder could not keep is counted, and what it cannot do is named."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -44,51 +44,46 @@ def text_message(seq: int, text: str = "x") -> Message:
     return message_of("status", cdr.string(text), seq, seq, frame_id=-1)
 
 
-class Sender:
-    """A node that is the test itself."""
-
-    def __init__(self, socket: Any) -> None:
-        self.socket = socket
-        socket.recv()  # the subscription
-
-    def send(self, *messages: Message) -> None:
-        for message in messages:
-            self.socket.send_multipart(encode(message))
+Send = Callable[..., None]
 
 
 @contextmanager
-def recorded(tmp_path: Path, **options: Any) -> Iterator[tuple[Sender, Recorder, list[dict[str, Any]]]]:
-    """What the sender sends goes into `bag`; and what the recorder says."""
+def recorded(tmp_path: Path, **options: Any) -> Iterator[tuple[Send, Recorder, list[dict[str, Any]]]]:
+    """What is sent goes into `bag`; and what the recorder says."""
     endpoint = f"ipc://{tmp_path / 'data'}"
     asked = RecordOptions(tmp_path / "bag", node=NodeAddress(endpoint=endpoint), **options)
     with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket, recording(asked) as (recorder, said):
-        yield Sender(socket), recorder, said
+        socket.recv()  # the subscription
+
+        def send(*messages: Message | list[bytes]) -> None:
+            for message in messages:
+                socket.send_multipart(encode(message) if isinstance(message, Message) else message)
+
+        yield send, recorder, said
 
 
-def both(tmp_path: Path, name: str) -> list[list[BagMessage]]:
-    """The messages of a topic in the bag, and in what `recover` makes of it."""
-    if not (tmp_path / "saved").exists():
-        recover(tmp_path / "bag", tmp_path / "saved")
-    return [by_topic(tmp_path / folder)[name] for folder in ("bag", "saved")]
+def both(tmp_path: Path) -> list[dict[str, list[BagMessage]]]:
+    """What the bag holds, and what `recover` makes of it."""
+    recover(tmp_path / "bag", tmp_path / "saved")
+    return [by_topic(tmp_path / folder) for folder in ("bag", "saved")]
 
 
 @contextmanager
-def played(bag: Path, name: str) -> Iterator[Iterator[Message]]:
-    """The messages of a topic while a bag is played over and over."""
+def played(bag: Path, *names: str) -> Iterator[Iterator[Message]]:
+    """The messages of these topics while a bag is played over and over."""
     run_dir = bag.parent / "run"
     player = Player(bag, PlayOptions(loop=True), PublishConfig(data=(), control=None, run_dir=run_dir))
     with beside(player.play, player.stop):
         until((run_dir / "sags.json").exists)
-        heard = listen_to(NodeAddress(run_dir=run_dir), [name], 60.0)
+        heard = listen_to(NodeAddress(run_dir=run_dir), names, 60.0)
         yield (arrived[0] for arrived in heard if arrived is not None)
 
 
 def test_gaps_repeats_and_strangers_are_counted(tmp_path: Path) -> None:
-    with recorded(tmp_path) as (sender, recorder, said):
-        sender.send(*map(text_message, (3, 4, 4, 7, 8, 3, 12)))
-        sender.socket.send_multipart([b"sags/status", b"junk", b"junk"])
+    with recorded(tmp_path) as (send, recorder, said):
+        send(*map(text_message, (3, 4, 4, 7, 8, 3, 12)))
         of_own = msgspec.structs.replace(text_message(1).meta, type="my_msgs/msg/Own")
-        sender.send(Message("sags/own", of_own, (b"1234",)))
+        send([b"sags/status", b"junk", b"junk"], Message("sags/own", of_own, (b"1234",)))
         until(lambda: recorder.summary()["rejected"])
     row = said[-1]["topics"]["sags/status"]
     assert row == {"messages": 5, "dropped": 0, "lost": 2 + 3} and said[-1]["rejected"] == 1
@@ -107,28 +102,38 @@ def test_what_cannot_be_written_ends_nothing_in_silence(
     body = Content(kind, (b"\0\1\0\0" + bytes(5),)) if error is None else cdr.string("{}")
     with (
         nullcontext() if error is None else pytest.raises(SagsError, match=r"cannot write .*bag: .*Error"),
-        recorded(tmp_path) as (sender, recorder, said),
+        recorded(tmp_path) as (send, recorder, said),
     ):
-        sender.send(message_of(name, body, 1, 1, frame_id=1), *map(text_message, range(1, 9)))
+        send(message_of(name, body, 1, 1, frame_id=1), *map(text_message, range(1, 9)))
         until(lambda: attach.called or recorder.summary()["messages"] == 8)
     if error is None:
         assert said[-1]["messages"] == 8 and said[-1]["rejected"] == 1
         assert bag_info(tmp_path / "bag")["messages"] == 8
 
 
-def test_lengths_without_a_unit_stay_so_in_a_bag_and_when_it_is_played(tmp_path: Path) -> None:
-    """Beside those of a node that is calibrated by then."""
+def test_what_headers_say_stays_so_in_a_bag_and_when_it_is_played(tmp_path: Path) -> None:
+    """That lengths have no unit, until the node is calibrated; that an image is ahead."""
     depth, info = cdr.image(np.ones((4, 4), np.float32), "32FC1", 1), cdr.camera_info(plane_camera(), 1)
-    with recorded(tmp_path) as (sender, recorder, _):
-        for seq, units in ((1, "relative"), (2, msgspec.UNSET)):
-            for name, body in (("left/depth", depth), ("left/camera_info", info)):
-                sender.send(message_of(name, body, seq, seq, units=units))
-        until(lambda: recorder.summary()["messages"] == 4)
-    for depths, infos in zip(both(tmp_path, "left/depth"), both(tmp_path, "left/camera_info"), strict=True):
-        assert [message.relative for message in depths] == [True, False]
-        assert [cdr.decode(m.data, m.type).k.any() for m in infos] == [False, True]
-    with played(tmp_path / "bag", "left/depth") as heard:
-        assert any(message.meta.units == "relative" for message in heard)
+    view = cdr.image(np.ones((4, 4), np.uint8), "mono8", 1)
+    with recorded(tmp_path) as (send, recorder, _):
+        for seq, units, ahead in ((1, "relative", msgspec.UNSET), (2, msgspec.UNSET, 93_400_000)):
+            send(
+                message_of("left/depth", depth, seq, seq, units=units),
+                message_of("left/camera_info", info, seq, seq, units=units),
+                message_of("view/a/image", view, seq, seq, ahead_ns=ahead),
+            )
+        until(lambda: recorder.summary()["messages"] == 6)
+    for kept in both(tmp_path):
+        assert [message.relative for message in kept["left/depth"]] == [True, False]
+        assert [cdr.decode(m.data, m.type).k.any() for m in kept["left/camera_info"]] == [False, True]
+        assert [message.ahead_ns for message in kept["view/a/image"]] == [0, 100_000_000]
+    came: dict[str, set[object]] = {"sags/left/depth": set(), "sags/view/a/image": set()}
+    with played(tmp_path / "saved", "left/depth", "view/a/image") as heard:
+        while sum(map(len, came.values())) < 4:
+            message = next(heard)
+            came[message.topic].add((message.meta.units, message.meta.ahead_ns))
+    no = msgspec.UNSET
+    assert list(came.values()) == [{("relative", no), (no, no)}, {(no, no), (no, 100_000_000)}]
 
 
 @pytest.mark.fault("node: started anew while it is recorded")
@@ -136,13 +141,13 @@ def test_lengths_without_a_unit_stay_so_in_a_bag_and_when_it_is_played(tmp_path:
 def test_a_node_that_was_started_anew_is_played_as_such(limits: Limits, tmp_path: Path) -> None:
     """Anchors of one number are other points then; so are stamps and Gaussians in a new epoch."""
     sent = [("a", 0)] * 3 + [("a", 1)] * 2 + [("b", 0)] * 3
-    with recorded(tmp_path, limits=limits) as (sender, recorder, _):
+    with recorded(tmp_path, limits=limits) as (send, recorder, _):
         for seq, (session, epoch) in enumerate(sent, 1):
             said = cdr.string(f"{session}{epoch}")
-            sender.send(message_of("status", said, seq, session=session, epoch=epoch))
+            send(message_of("status", said, seq, session=session, epoch=epoch))
         until(lambda: recorder.summary()["messages"] == len(sent))
-    for kept in both(tmp_path, "status"):
-        assert [(m.session, m.epoch) for m in kept] == sent
+    for kept in both(tmp_path):
+        assert [(m.session, m.epoch) for m in kept["status"]] == sent
     came: dict[tuple[str, int], str] = {}
     with played(tmp_path / "bag", "status") as heard:
         while len(came) <= 8:  # two passes
@@ -156,38 +161,21 @@ def test_a_node_that_was_started_anew_is_played_as_such(limits: Limits, tmp_path
 
 @pytest.mark.fault("network: two nodes send under one name while it is recorded")
 @pytest.mark.parametrize("sessions", ["aaabbb", "ababab"])
-def test_two_nodes_under_one_name_are_told_of(
-    sessions: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_two_nodes_are_told_of(sessions: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """One that is started anew is not."""
-    with recorded(tmp_path) as (sender, recorder, _):
+    with recorded(tmp_path) as (send, recorder, _):
         for seq, session in enumerate(sessions, 1):
-            sender.send(message_of("status", cdr.string(session), seq, session=session))
+            send(message_of("status", cdr.string(session), seq, session=session))
         until(lambda: recorder.summary()["messages"] == len(sessions))
     assert caplog.text.count("two nodes send under this name") == (sessions == "ababab")
-
-
-def test_a_prediction_stays_one_when_it_is_played(tmp_path: Path) -> None:
-    picture, name = cdr.image(np.ones((4, 4), np.uint8), "mono8", 1), "view/a/image"
-    with recorded(tmp_path) as (sender, recorder, _):
-        for seq, ahead in enumerate((msgspec.UNSET, 93_400_000), 1):
-            sender.send(message_of(name, picture, seq, seq, ahead_ns=ahead))
-        until(lambda: recorder.summary()["messages"] == 2)
-    for kept in both(tmp_path, name):
-        assert [message.ahead_ns for message in kept] == [0, 100_000_000]
-    came: set[object] = set()
-    with played(tmp_path / "saved", name) as heard:
-        while len(came) < 2:
-            came.add(next(heard).meta.ahead_ns)
-    assert came == {msgspec.UNSET, 100_000_000}
 
 
 def test_a_key_colour_stays_exact(tmp_path: Path) -> None:
     """A display shows the camera where the pixel is the key, and nowhere else."""
     picture = np.full((32, 32, 3), (0, 0, 255), np.uint8)
     picture[10:20, 11:21] = 255, 120, 0
-    with recorded(tmp_path, compression="jpeg") as (sender, recorder, _):
-        sender.send(message_of("left/overlay/color_key", cdr.image(picture, "rgb8", 1)))
+    with recorded(tmp_path, compression="jpeg") as (send, recorder, _):
+        send(message_of("left/overlay/color_key", cdr.image(picture, "rgb8", 1)))
         until(lambda: recorder.summary()["messages"])
     (kept,) = by_topic(tmp_path / "bag")["left/overlay/color_key/compressed"]
     assert np.array_equal(decode_picture(kept.data, kept.type, ""), picture)
@@ -216,8 +204,8 @@ def test_what_a_person_should_know_of_a_recording() -> None:
 
 @pytest.mark.fault("memory: too little for the seconds of a snapshot")
 def test_a_ring_says_how_much_it_holds(tmp_path: Path) -> None:
-    with recorded(tmp_path, snapshot_seconds=60, max_cache_mb=0.005) as (sender, recorder, said):
-        sender.send(*(text_message(seq, "y" * 1000) for seq in range(1, 20)))
+    with recorded(tmp_path, snapshot_seconds=60, max_cache_mb=0.005) as (send, recorder, said):
+        send(*(text_message(seq, "y" * 1000) for seq in range(1, 20)))
         until(lambda: recorder.summary()["dropped"] >= 15)
         recorder.snapshot()
         until(lambda: "snapshot" in said[-1])
@@ -230,9 +218,9 @@ def test_a_ring_says_how_much_it_holds(tmp_path: Path) -> None:
 
 def test_snapshots_hold_the_last_seconds(tmp_path: Path) -> None:
     """And the last message of a latched topic, however old it is."""
-    with recorded(tmp_path, snapshot_seconds=0.3) as (sender, recorder, said):
+    with recorded(tmp_path, snapshot_seconds=0.3) as (send, recorder, said):
         for number, name in enumerate(("parameters", "health", "tf")):
-            sender.send(message_of(name, cdr.string("{}"), 1, 1, frame_id=-1))
+            send(message_of(name, cdr.string("{}"), 1, 1, frame_id=-1))
             until(lambda: f"sags/{name}" in recorder.summary()["topics"])  # noqa: B023, used at once
             recorder.snapshot()
             until(lambda: len(said) > 1 + number)  # noqa: B023, used at once

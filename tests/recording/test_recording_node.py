@@ -9,12 +9,10 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import pytest
 from command_line import RUN_HERE, killed, pure_json, refused, sags, start, stopped, wait_for
-from mcap.reader import make_reader
 from recorded_plane import by_topic
 from rosbags.highlevel import AnyReader
 from waiting import START_SECONDS, until
@@ -24,7 +22,7 @@ from sags_node.clients.recording.info import bag_info
 from sags_node.config.schema import PhantomSource
 from sags_node.errors import SagsError
 from sags_node.messaging.control import ControlClient
-from sags_node.messaging.received import ReceivedImage
+from sags_node.messaging.received import ReceivedImage, TopicName
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.topics import TOPICS
 from sags_node.phantom import write_session
@@ -57,6 +55,11 @@ def frames_pass(home: Path, count: int) -> None:
             assert newest is not None
 
 
+def recording_tf(bag: Path) -> list[str]:
+    """A command."""
+    return [sys.executable, "-m", "sags_node", "bag", "record", "-o", str(bag), "--topics", "tf"]
+
+
 def start_recorder(home: Path, *arguments: object) -> subprocess.Popen[str]:
     return start(["bag", "record", *arguments], XDG_RUNTIME_DIR=home)
 
@@ -64,7 +67,7 @@ def start_recorder(home: Path, *arguments: object) -> subprocess.Popen[str]:
 @pytest.mark.fault("process: the recorder is killed")
 def test_a_killed_recording_is_recovered_and_replayed(node: Path, tmp_path: Path) -> None:
     seen: dict[int, dict[str, np.ndarray]] = {}
-    eyes = ["left/image_rect_color", "right/image_rect_color"]
+    eyes = [TopicName(f"{eye}/image_rect_color", ReceivedImage) for eye in ("left", "right")]
     with Subscriber(eyes, run_dir=node / "sags") as subscriber:
         process = start_recorder(node, "-o", tmp_path / "bag")
         bag_file = tmp_path / "bag/bag_0.mcap"
@@ -75,8 +78,7 @@ def test_a_killed_recording_is_recovered_and_replayed(node: Path, tmp_path: Path
             newest = subscriber.wait(eyes[0], 1, after=newest)
             pair = newest and subscriber.aligned(eyes, newest.stamp_ns, timeout=0.5)
             if newest and pair:
-                arrays = {name: cast(ReceivedImage, message).array.copy() for name, message in pair.items()}
-                seen[newest.stamp_ns] = arrays
+                seen[newest.stamp_ns] = {name: pair[name].array.copy() for name in eyes}
         process.kill()
         process.wait()
     assert not (tmp_path / "bag/metadata.yaml").exists()
@@ -89,9 +91,6 @@ def test_a_killed_recording_is_recovered_and_replayed(node: Path, tmp_path: Path
         every_second = {"/sags/diagnostics"}  # may not have come yet
         wanted = {f"/sags/{topic.name}" for topic in TOPICS}
         assert {c.topic for c in reader.connections} | every_second == wanted
-    with (tmp_path / "saved/saved_0.mcap").open("rb") as opened:
-        reader2 = make_reader(opened, validate_crcs=True)
-        assert sum(1 for _ in reader2.iter_messages()) == done["messages"]
     session = open_session(tmp_path / "saved", ["source.pace:=step"])
     compared = 0
     with session.source as source:
@@ -132,10 +131,7 @@ def test_the_end_of_the_terminal_closes_the_file(node: Path, tmp_path: Path) -> 
     """As `ssh` that is cut off leaves it: the kernel sends SIGHUP, and nothing can be printed any more."""
     ours, theirs = pty.openpty()
     program = subprocess.Popen(
-        [
-            *("setsid", "--ctty", "--wait", sys.executable, "-m", "sags_node"),
-            *("bag", "record", "-o", str(tmp_path / "bag"), "--topics", "tf"),
-        ],
+        ["setsid", "--ctty", "--wait", *recording_tf(tmp_path / "bag")],
         env={**os.environ, "XDG_RUNTIME_DIR": str(node)},
         stdin=theirs, stdout=theirs, stderr=theirs,
     )  # fmt: skip
@@ -150,8 +146,7 @@ def test_the_end_of_the_terminal_closes_the_file(node: Path, tmp_path: Path) -> 
 
 
 def test_a_recorder_that_nohup_started_outlives_its_terminal(node: Path, tmp_path: Path) -> None:
-    command = ["nohup", sys.executable, "-m", "sags_node", "bag", "record", "-o", str(tmp_path / "bag")]
-    command += ["--topics", "tf"]
+    command = ["nohup", *recording_tf(tmp_path / "bag")]
     environment = {**os.environ, "XDG_RUNTIME_DIR": str(node)}
     with killed(subprocess.Popen(command, env=environment, stderr=subprocess.PIPE)) as process:
         while b"recording: " not in process.stderr.readline():
@@ -165,29 +160,20 @@ def test_a_recorder_that_nohup_started_outlives_its_terminal(node: Path, tmp_pat
 
 def test_recording_on_the_control_socket(node: Path, tmp_path: Path) -> None:
     with ControlClient(run_dir=node / "sags") as control:
-        with pytest.raises(SagsError, match="nothing is being recorded"):
-            control.request("stop_recording", timeout=60)
         for wrong in ({}, {"path": "x", "speed": 3}, {"path": "x", "compression": "gif"}):
             with pytest.raises(SagsError, match="start_recording takes path"):
                 control.request("start_recording", wrong, timeout=60)
         args = {"path": str(tmp_path / "bag"), "topics": ["left/depth"]}
-        assert control.request("start_recording", args, timeout=30) == {"recording": str(tmp_path / "bag")}
+        assert control.request("start_recording", args, timeout=60) == {"recording": str(tmp_path / "bag")}
         with pytest.raises(SagsError, match="running already"):
             control.request("start_recording", args, timeout=60)
         with pytest.raises(SagsError, match="snapshot_seconds"):  # the recording goes on
             control.request("take_snapshot", timeout=60)
         frames_pass(node, 15)
-        summary = control.request("stop_recording", timeout=30)
+        summary = control.request("stop_recording", timeout=60)
         assert summary["messages"] == len(by_topic(tmp_path / "bag")["left/depth"]) > 3
         with pytest.raises(SagsError, match="exists already; name a new folder"):
             control.request("start_recording", args, timeout=60)
-        args = {"path": str(tmp_path / "ring"), "snapshot_seconds": 1, "max_bag_size": 2_000_000}
-        control.request("start_recording", args, timeout=30)
-        frames_pass(node, 10)
-        taken = control.request("take_snapshot", timeout=30)
-        saved = bag_info(Path(taken["snapshot"]))
-        assert saved["messages"] == taken["messages"] > 5 and len(saved["files"]) > 1
-        assert control.request("stop_recording", timeout=30)["messages"] == taken["messages"]
 
 
 # ---- `sags bag record --session`: a recording goes through a node into a bag, and nothing is left ------
