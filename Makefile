@@ -7,8 +7,8 @@ STAMP := $(VENV)/.installed
 # Shared libraries that Open3D needs and its wheel does not bring.
 DEBIAN := libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6 libidn2-0
 # What tests use beyond that: a browser for the viewer and the web gateway, compilers for the C++ and C# clients
-# and OpenIGTLink's peers, GStreamer.
-DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev \
+# and OpenIGTLink's peers, two machines in one, GStreamer.
+DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev faketime iproute2 \
   libopenigtlink-dev openigtlink-examples \
   mono-mcs mono-runtime libmono-system-runtime-serialization4.0-cil \
   gstreamer1.0-tools gstreamer1.0-plugins-base gstreamer1.0-plugins-good gstreamer1.0-plugins-bad \

@@ -1,15 +1,22 @@
-"""What lies between a node and its client: a connection that can be cut."""
+"""What lies between a node and its client: a connection that can be cut, and that may be slow."""
 
 import socket
 import threading
+import time
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Self
 
 
 class Cable:
-    """Passes connections on. Those that are open when it is cut stay open, and silent."""
+    """Passes connections on. Those that are open when it is cut stay open, and silent.
 
-    def __init__(self, endpoint: str) -> None:
+    Args:
+        delay: s by which the next bytes come later, each way.
+    """
+
+    def __init__(self, endpoint: str, delay: Callable[[], float] = lambda: 0.0) -> None:
+        self._delay = delay
         host, port = endpoint.removeprefix("tcp://").split(":")
         self._far = (host, int(port))
         self._listener = socket.create_server(("127.0.0.1", 0))
@@ -41,6 +48,7 @@ class Cable:
     def _pass(self, source: socket.socket, target: socket.socket, cut: threading.Event) -> None:
         try:
             while (data := source.recv(65536)) and not cut.is_set():
+                time.sleep(self._delay())
                 target.sendall(data)
         except OSError:
             return
