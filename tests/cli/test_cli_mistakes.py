@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 LAUNCH = ROOT / "launch"
 
 
-def named(rows: list[tuple[str, Any, *tuple[str, ...]]]) -> list[Any]:
+def named(rows: list[Any]) -> list[Any]:
     """Rows of a table by their commands."""
     return [pytest.param(*row[:2], row[2:], id=row[0].replace(str(ROOT), "")) for row in rows]
 
