@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +16,8 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
-from bridging import SEEN, anchored_at, sockets
+from bridging import SEEN, Pinned, anchored_at, sockets
+from command_line import killed
 from places import ROOT, SESSION
 from synthetic import plane_result, stream
 from waiting import until
@@ -86,52 +88,37 @@ def test_all_start_and_end_together_and_the_notebook_plots_what_was_recorded(
     )
 
 
-def test_a_point_is_not_followed_into_another_session_of_the_node(tmp_path: Path) -> None:
-    asked: list[tuple[int, str]] = []
-
-    def node(number: int) -> dict[str, Any]:
-        return {
-            "add_anchor": lambda args: asked.append((number, "add")) or {"id": SEEN},
-            "remove_anchor": lambda args: asked.append((number, "remove")),
-        }
-
-    environment = os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)}
+def following(run_dir: Path) -> AbstractContextManager[subprocess.Popen[str]]:
+    """The example that follows a point."""
     command = [sys.executable, ROOT / "examples/follow_point.py", "20", "20"]
-    with subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as example:
-        with sockets(tmp_path / "sags", node(1)) as running, stream(running, anchored_at):
+    environment, pipe = os.environ | {"XDG_RUNTIME_DIR": str(run_dir.parent)}, subprocess.PIPE
+    return killed(subprocess.Popen(command, env=environment, stdout=pipe, stderr=pipe, text=True))
+
+
+def test_a_point_is_not_followed_into_another_session_of_the_node(tmp_path: Path) -> None:
+    run_dir, first, second = tmp_path / "sags", Pinned(SEEN), Pinned(SEEN)
+    with following(run_dir) as example:
+        with sockets(run_dir, first.handlers) as running, stream(running, anchored_at):
             assert "m" in example.stdout.readline()
-        with sockets(tmp_path / "sags", node(2)) as running, stream(running, anchored_at):
+        with sockets(run_dir, second.handlers) as running, stream(running, anchored_at):
             _, errors = example.communicate(timeout=60)
-    assert example.returncode == 1 and "started anew" in errors and asked == [(1, "add")]
+    assert example.returncode == 1 and "started anew" in errors
+    assert len(first.added) == 1 and not first.removed + second.added + second.removed
 
 
 def test_a_point_that_was_removed_is_followed_no_more(tmp_path: Path) -> None:
-    asked: list[str] = []
-    handlers = {
-        "add_anchor": lambda args: asked.append("add") or {"id": SEEN},
-        "remove_anchor": lambda args: asked.append("remove"),
-    }
-    removed = threading.Event()
+    run_dir, node, removed = tmp_path / "sags", Pinned(SEEN), threading.Event()
 
     def frame(number: int) -> FrameResult:
         result = anchored_at(number)
         return replace(result, anchors=plane_result().anchors) if removed.is_set() else result
 
-    environment = os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)}
-    command = [sys.executable, ROOT / "examples/follow_point.py", "20", "20"]
-    with (
-        subprocess.Popen(
-            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        ) as example,
-        sockets(tmp_path / "sags", handlers) as running,
-        stream(running, frame),
-    ):
+    with following(run_dir) as example, sockets(run_dir, node.handlers) as running, stream(running, frame):
         assert "m" in example.stdout.readline()
         removed.set()
         _, errors = example.communicate(timeout=60)
-    assert example.returncode == 1 and "somebody else removed the point" in errors and asked == ["add"]
+    assert example.returncode == 1 and "somebody else removed the point" in errors
+    assert len(node.added) == 1 and not node.removed
 
 
 @pytest.mark.parametrize(
@@ -143,7 +130,7 @@ def test_a_point_that_was_removed_is_followed_no_more(tmp_path: Path) -> None:
         ("record_board.py FILE", "error: cannot write"),
         ("record_board.py FULL", "exists already"),
         ("send_phantom.py push --rate 0", "must be above 0"),
-        ("send_phantom.py push --endpoint nonsense", "error: cannot connect to nonsense"),
+        ("send_phantom.py push --size 64 64 --endpoint nonsense", "error: cannot connect to nonsense"),
     ],
 )
 def test_wrong_use_of_an_example_is_one_message(tmp_path: Path, example: str, said: str) -> None:

@@ -61,9 +61,13 @@ def given(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 @pytest.mark.live
 @pytest.mark.parametrize(
     ("overrides", "ms"),
-    [(["source.rate:=60"], 0.9 * 1000 / 60), (["source.rate:=25"], 0.9 * 40), ([], 0.9 * 100),
-     (["source.rate:=60", "mapping.budget_ms:=25"], 25), (["source.pace:=fast"], 33)],
-)  # fmt: skip
+    [
+        (["source.rate:=60"], 0.9 * 1000 / 60),
+        ([], 0.9 * 100),
+        (["source.rate:=60", "mapping.budget_ms:=25"], 25),
+        (["source.pace:=fast"], 33),
+    ],
+)
 def test_a_node_gives_a_frame_the_time_until_the_next(
     overrides: list[str], ms: float, given: list[float], tmp_path: Path
 ) -> None:

@@ -1,7 +1,5 @@
 """Whatever is written, a full disk is one line and exit code 1, and nothing half written stays."""
 
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -104,16 +102,10 @@ def test_what_stood_there_stays(disk: Path, tiny: Path) -> None:
     assert there(disk) == {"x.ply", "x.json"}
 
 
-def a_still(disk: Path) -> None:
-    output = Output(disk / "x.png")
-    output.add(np.random.default_rng(0).integers(0, 255, (256, 320, 3), np.uint8), True, 1 / 30)
-    output.close()
-
-
-def a_video(disk: Path) -> None:
-    output = Output(disk / "x.mp4")
-    rng = np.random.default_rng(0)
-    for _ in range(40):
+def shown(file: Path, frames: int) -> None:
+    """What the overlay keeps."""
+    output, rng = Output(file), np.random.default_rng(0)
+    for _ in range(frames):
         output.add(rng.integers(0, 255, (256, 320, 3), np.uint8), True, 1 / 30)
     output.close()
 
@@ -128,8 +120,8 @@ def a_data_set(disk: Path) -> None:
 
 WRITERS: dict[str, Callable[[Path], Any]] = {
     "the node's model": lambda disk: write_ply(disk / "x.ply", random_gaussians(0, 1000, camera())),
-    "the overlay's image": a_still,
-    "the overlay's video": a_video,
+    "the overlay's image": lambda disk: shown(disk / "x.png", 1),
+    "the overlay's video": lambda disk: shown(disk / "x.mp4", 40),
     "a hand-eye calibration": lambda disk: save_hand_eye(HandEye(np.eye(4)), disk / "rig", {}),
     "a data set of many recordings": a_data_set,
     "a table": lambda disk: write_json(disk / "x.json", {}),
@@ -149,7 +141,7 @@ def test_a_writer_without_a_command_does_the_same(disk: Path, name: str) -> None
 def test_a_video_that_gets_no_more_is_told_of_at_once(disk: Path, caplog: pytest.LogCaptureFixture) -> None:
     fill(disk, 0)
     with pytest.raises(SagsError, match=NO_SPACE):
-        a_video(disk)
+        shown(disk / "x.mp4", 40)
     assert caplog.messages == [f"{disk / 'x.mp4'} gets no more images: {NO_SPACE}; the overlay goes on"]
 
 
@@ -161,12 +153,3 @@ def test_a_recording_keeps_what_it_has(disk: Path, tiny: Path) -> None:
     said = ("bag", "record", "--session", tiny, *SMALL, "-o", disk / "bag")
     refused(1, *said, said=(NO_SPACE, f"sags bag recover {disk / 'bag'} -o OUT"))
     assert there(disk) == {"bag/bag_0.mcap"} and (disk / "bag/bag_0.mcap").stat().st_size > 50_000
-
-
-def test_figures_that_nobody_can_take(tmp_path: Path) -> None:
-    with Path("/dev/full").open("wb") as full:
-        command = [sys.executable, "-m", "sags_node", "doctor", "--json", "device:=cpu"]
-        done = subprocess.run(
-            command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120, check=False
-        )
-    assert done.returncode == 1 and NO_SPACE in done.stderr and len(done.stderr.splitlines()) == 1

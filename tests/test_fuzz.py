@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from fuzzing import IN_MEMORY, LONGEST, TARGETS, HungError, Target, bounded_memory, damaged, ended_in_time
+from fuzzing import IN_MEMORY, LONGEST, TARGETS, HungError, Target, bounded_memory, damaged
 from hypothesis import HealthCheck, Phase, given, seed, settings
 
 from sags_node.errors import SagsError
@@ -79,7 +79,9 @@ def test_what_once_failed(name: str, tmp_path: Path) -> None:
     target.try_out(FAILED_ONCE[name](target.sound(tmp_path / "sound")), tmp_path / "it")
 
 
-def test_a_reader_that_fails_is_found(tmp_path: Path) -> None:
+def test_a_reader_that_fails_or_hangs_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fuzzing.LONGEST", 0.05)
+
     def traceback(data: bytes, _: Path) -> None:
         if data[:1] == b"\0":
             raise ValueError("no such thing")
@@ -87,15 +89,12 @@ def test_a_reader_that_fails_is_found(tmp_path: Path) -> None:
     def two_lines(data: bytes, _: Path) -> None:
         raise SagsError("one\ntwo")
 
-    for number, (use, error) in enumerate(((traceback, ValueError), (two_lines, AssertionError))):
-        with pytest.raises(error):
-            fuzz(Target(lambda _: [b"sound"], use), QUICK, 0, tmp_path / str(number))
-
-
-def test_a_reader_that_hangs_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fuzzing.LONGEST", 0.05)
-    with pytest.raises(HungError), ended_in_time():
+    def hang(data: bytes, _: Path) -> None:
         time.sleep(LONGEST)
+
+    for use, error in ((traceback, ValueError), (two_lines, AssertionError), (hang, HungError)):
+        with pytest.raises(error):
+            fuzz(Target(lambda _: [b"sound"], use), QUICK, 0, tmp_path / use.__name__)
 
 
 def main(minutes: float, *names: str) -> int:

@@ -18,7 +18,6 @@ from sags_node.bags.pictures import decode_file
 from sags_node.clients.overlay.save import Output
 from sags_node.config import schema as cfg
 from sags_node.errors import SagsError, UsageError
-from sags_node.files import open_file
 from sags_node.media import picture_file
 from sags_node.media.picture_file import claimed_size, is_whole, native_output
 from sags_node.sources.numbered import open_numbered
@@ -60,7 +59,7 @@ BAD = {
     "flipped.png": (flipped(png(), 80), "libpng error: "),
     "headless.jpg": (
         b"\xff\xd8\xff\xd9",
-        "is no JPEG, PNG, TIFF, BMP, WebP or binary PGM/PPM, or is damaged (4 bytes)",
+        "is no JPEG, PNG, TIFF, BMP, WebP or binary PGM/PPM, or is damaged (",
     ),
 }
 
@@ -114,14 +113,17 @@ def test_sizes_are_read_as_opencv_reads_them(suffix: str, size: tuple[int, int])
 
 @pytest.mark.parametrize("suffix", KINDS)
 def test_all_kinds_of_pictures_are_read_and_cut_off_ones_are_refused(suffix: str, tmp_path: Path) -> None:
-    """Drawn smooth, so that lossy kinds keep it; lossless WebP has a header of its own."""
+    """Also through a link. Drawn smooth, so that lossy kinds keep it; lossless WebP has its own header."""
     smooth = cv2.resize(PIXELS[:4, :5], (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
     for options in (KINDS[suffix], [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix == ".webp" else []):
         content = cv2.imencode(suffix, smooth, options)[1].tobytes()
         assert claimed_size(memoryview(content)) == (WIDTH, HEIGHT) and is_whole(memoryview(content))
         file = tmp_path / f"one{suffix}"
         file.write_bytes(content)
-        assert np.abs(read_picture(file)[..., ::-1].astype(int) - smooth).mean() < 8  # of 255
+        link = tmp_path / f"link{suffix}"
+        link.unlink(missing_ok=True)
+        link.symlink_to(file)
+        assert np.abs(read_picture(link)[..., ::-1].astype(int) - smooth).mean() < 8  # of 255
         file.write_bytes(content[: len(content) * 2 // 3])
         with pytest.raises(SagsError, match="damaged or cut off"):
             read_picture(file)
@@ -179,30 +181,20 @@ NO_FILES: dict[str, Callable[[Path], None]] = {
 @pytest.mark.parametrize("kind", NO_FILES)
 def test_what_is_no_file_is_not_waited_for(kind: str, tmp_path: Path) -> None:
     recordings(tmp_path)
-    make = NO_FILES[kind]
-    make(tmp_path / "r/000a.png")
-    with pytest.raises(UsageError, match=r"r/000a\.png has an image's name but is no file; remove it"):
-        open_source(cfg.FoldersSource(left=tmp_path / "l", right=tmp_path / "r"))
-    with pytest.raises(SagsError, match=r"cannot read image .*000a\.png: it is a"):
-        read_picture(tmp_path / "r/000a.png")
-    make(tmp_path / "poses.npz")
-    with pytest.raises(UsageError, match=r"poses\.npz is not a readable npz file: .*it is a"):
-        (tmp_path / "r/000a.png").rename(tmp_path / "aside")
-        open_source(
-            cfg.FoldersSource(left=tmp_path / "l", right=tmp_path / "r", poses=tmp_path / "poses.npz")
-        )
     (tmp_path / "numbered").mkdir()
-    make(tmp_path / "numbered/0.json")
-    files = open_numbered(tmp_path / "numbered", ".json", 100)
+    picture, poses, numbered = (tmp_path / name for name in ("r/000a.png", "poses.npz", "numbered/0.json"))
+    for file in (picture, poses, numbered):
+        NO_FILES[kind](file)
+    folders = {"left": tmp_path / "l", "right": tmp_path / "r"}
+    with pytest.raises(UsageError, match=r"r/000a\.png has an image's name but is no file; remove it"):
+        open_source(cfg.FoldersSource(**folders))
+    with pytest.raises(SagsError, match=r"cannot read image .*000a\.png: it is a"):
+        read_picture(picture)
+    picture.rename(tmp_path / "aside")
+    with pytest.raises(UsageError, match=r"poses\.npz is not a readable npz file: .*it is a"):
+        open_source(cfg.FoldersSource(**folders, poses=poses))
     with pytest.raises(SagsError, match=r"0\.json: it is a"):
-        files.read(0)
-
-
-def test_a_link_to_a_file_is_one(tmp_path: Path) -> None:
-    (tmp_path / "file").write_bytes(b"content")
-    (tmp_path / "link").symlink_to("file")
-    with open_file(tmp_path / "link") as opened:
-        assert opened.read() == b"content"
+        open_numbered(numbered.parent, ".json", 100).read(0)
 
 
 # ---- libraries that talk ---------------------------------------------------------------------------------
@@ -237,9 +229,7 @@ def test_a_video_shows_each_picture_for_as_long_as_its_stamps_say(
     output.close()
     with av.open(str(tmp_path / "video.mp4")) as video:
         assert video.streams.video[0].codec_context.name == "h264"
-        times = [
-            float(frame.pts * frame.time_base) for frame in video.decode(video=0) if frame.pts is not None
-        ]
+        times = [float(frame.pts * frame.time_base) for frame in video.decode(video=0)]
     np.testing.assert_allclose(np.diff(times), shown, atol=2.1 / 90_000)
 
 

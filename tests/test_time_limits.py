@@ -26,25 +26,18 @@ from sags_node.sources.v4l2 import open_cameras
 
 pytestmark = pytest.mark.live
 
-DEAF = """
-import signal, time
-signal.signal(signal.SIGTERM, signal.SIG_IGN)
-print("deaf", flush=True)
-time.sleep(99)
-"""
+LISTENS = "import time; print('begun', flush=True); time.sleep(99)"
+DEAF = f"import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); {LISTENS}"
 
 
-def test_a_process_that_does_not_listen_is_killed() -> None:
-    with subprocess.Popen([sys.executable, "-c", DEAF], stdout=subprocess.PIPE) as process:
+@pytest.mark.parametrize(
+    ("code", "grace", "ended_by"), [(DEAF, 0.1, signal.SIGKILL), (LISTENS, 30.0, signal.SIGTERM)]
+)
+def test_only_a_process_that_does_not_listen_is_killed(code: str, grace: float, ended_by: int) -> None:
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None and process.stdout.readline()
-        assert processes.end(process, grace=0.1)
-        assert process.returncode == -signal.SIGKILL
-
-
-def test_a_process_that_listens_is_not(tmp_path: Path) -> None:
-    with subprocess.Popen(["sleep", "99"]) as process:
-        assert processes.end(process, grace=30.0)
-        assert process.returncode == -signal.SIGTERM
+        assert processes.end(process, grace)
+        assert process.returncode == -ended_by
 
 
 @pytest.mark.fault("process: the publishing thread fails")

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from command_line import killed, refused, sags, start
+from command_line import killed, refused, start
 from igtl_peer import PEER, Peer, built
 from places import SESSION
 from running_node import RunningNode
@@ -61,49 +61,33 @@ def test_a_pinned_anchor_comes_back_and_a_killed_node_leaves_nothing_standing(tm
                 assert second.stderr is not None and "Traceback" not in second.stderr.read()
 
 
-OPEN = ("without keys or encryption", "--insecure")
+OPEN = "would show", "without keys or encryption", "--insecure"
+BRIDGES, ROS2 = "pip install '.[bridges]'", "pip install '.[ros2]'"
 
 
 @pytest.mark.parametrize(
-    ("command", "said"),
+    ("command", "needs", "missing", "said"),
     [
-        ("openigtlink --host 0.0.0.0", ("--host 0.0.0.0 would show", *OPEN)),
-        ("foxglove --host 0.0.0.0", ("--host 0.0.0.0 would show", *OPEN)),
-        ("web --host 0.0.0.0", ("--host 0.0.0.0 would show", *OPEN)),
-        ("ros2 --interface eth0", ("--interface eth0 would show", *OPEN)),
-        ("ros2 --interface 'no such' --insecure", ("no such",)),
-        ("ros2 --interface none0 --insecure", ("there are:",)),
-        ("ros2 --view a/b", ("--view 'a/b'",)),
+        ("openigtlink --host 0.0.0.0", "", "", ("--host 0.0.0.0", *OPEN)),
+        ("foxglove --host 0.0.0.0", "", "", ("--host 0.0.0.0", *OPEN)),
+        ("web --host 0.0.0.0", "", "", ("--host 0.0.0.0", *OPEN)),
+        ("ros2 --interface eth0", "", "", ("--interface eth0", *OPEN)),  # said before ROS is needed
+        ("ros2 --interface 'no such' --insecure", "cyclonedds", "", ("no such",)),
+        ("ros2 --interface none0 --insecure", "cyclonedds", "", ("there are:",)),
+        ("ros2 --view a/b", "cyclonedds", "", ("--view 'a/b'",)),
+        ("openigtlink", "", "pyigtl", ("needs pyigtl", BRIDGES)),
+        ("foxglove", "", "foxglove", ("needs foxglove-sdk", BRIDGES)),
+        ("web", "", "websockets", ("needs websockets", BRIDGES)),
+        ("ros2", "", "cyclonedds.domain", (ROS2,)),
     ],
 )
-def test_a_place_or_a_view_that_may_not_be_or_cannot_be_is_refused(
-    command: str, said: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+def test_what_may_not_be_or_cannot_be_is_refused(
+    command: str, needs: str, missing: str, said: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if said[-1] not in OPEN:  # that is said before ROS is needed
-        pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install '.[ros2]'")
+    """A place that is open to others, a view that is none, and an extra that is not installed."""
+    if needs:
+        pytest.importorskip(needs, reason=f"ROS 2 needs: {ROS2}")
+    if missing:
+        monkeypatch.setitem(sys.modules, missing, None)
     monkeypatch.setattr(os, "nice", lambda by: 0)  # this process goes on
     refused(2, "bridge", *shlex.split(command), said=said)
-
-
-@pytest.mark.parametrize(
-    ("command", "module", "said"),
-    [
-        ("openigtlink", "pyigtl", ("needs pyigtl", "pip install '.[bridges]'")),
-        ("foxglove", "foxglove", ("needs foxglove-sdk", "pip install '.[bridges]'")),
-        ("web", "websockets", ("needs websockets", "pip install '.[bridges]'")),
-        ("ros2", "cyclonedds.domain", ("pip install '.[ros2]'",)),
-    ],
-)
-def test_a_missing_extra_is_named_with_the_way_to_get_it(
-    command: str, module: str, said: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, module, None)
-    monkeypatch.setattr(os, "nice", lambda by: 0)
-    refused(2, "bridge", command, said=said)
-
-
-def test_the_help_says_when_to_use_which() -> None:
-    text = sags("bridge", "--help").stdout
-    assert "3D Slicer" in text and "sags bridge openigtlink" in text
-    assert all(command in text for command in ("sags bridge foxglove", "sags bridge ros2", "sags view"))
-    assert "Unity" in text and "sags bridge web" in text and "sags bridge gst" in text

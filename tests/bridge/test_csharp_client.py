@@ -85,17 +85,22 @@ def until_line(process: subprocess.Popen[str], start: str) -> str:
         guard.cancel()
 
 
+@pytest.mark.fault("gateway: the node behind it is started anew")
 def test_it_shows_depth_colour_and_anchors_and_nothing_old(program: Path, tmp_path: Path) -> None:
     result = anchored()
     guessed = replace(result.anchors, depth_confidence=np.full(4, 0.25, np.float32))
     result, view = replace(result, anchors=guessed), result.views["left"]
     options = options_of(WebOptions, tmp_path, port=0)
-    with sockets(tmp_path) as node, bridged(run_web, options) as port, running(program, port) as process:
-        with stream(node, lambda i: at_frame(result, i, time.time_ns())):
-            found = LINE.fullmatch(until_line(process, "stamp_ns="))
-            until_line(process, "stamp_ns=")
-        assert "stale: too old" in until_line(process, "stale")
-        with stream(node, anchored_at):  # and comes back
+    with bridged(run_web, options) as port, running(program, port) as process:
+        with sockets(tmp_path) as node:
+            with stream(node, lambda i: at_frame(result, i, time.time_ns())):
+                found = LINE.fullmatch(until_line(process, "stamp_ns="))
+                until_line(process, "stamp_ns=")
+            assert "stale: too old" in until_line(process, "stale")
+            with stream(node, anchored_at):  # and comes back
+                until_line(process, "stamp_ns=")
+        until_line(process, "stale")
+        with sockets(tmp_path) as node, stream(node, anchored_at):  # another node
             until_line(process, "stamp_ns=")
     middle = (HEIGHT // 2, WIDTH // 2)
     _, height, width, depth_mm, rgba, anchors = found.groups()
@@ -105,18 +110,6 @@ def test_it_shows_depth_colour_and_anchors_and_nothing_old(program: Path, tmp_pa
     first = anchors.split(";")[0].split(":")
     assert list(map(float, first[2:])) == [1, 0.25], "seen, and its depth a guess"
     assert int(first[0]) == SEEN and float(first[1]) == pytest.approx(0.07) and len(anchors.split(";")) == 3
-
-
-@pytest.mark.fault("gateway: the node behind it is started anew")
-def test_it_shows_the_next_node_as_well(program: Path, tmp_path: Path) -> None:
-    with (
-        bridged(run_web, options_of(WebOptions, tmp_path, port=0)) as port,
-        running(program, port) as process,
-    ):
-        for _ in range(2):
-            with sockets(tmp_path) as node, stream(node, anchored_at):
-                until_line(process, "stamp_ns=")
-            until_line(process, "stale")
 
 
 def test_the_part_for_unity_compiles(program: Path, tmp_path: Path) -> None:

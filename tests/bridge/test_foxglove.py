@@ -6,14 +6,15 @@ import re
 import struct
 import sys
 import threading
-import time
+from collections.abc import Iterator
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from bridging import anchored_at, bridged, options_of, plane_bridged, sockets
+from bridging import FRAME_TOPICS, Pinned, anchored_at, asked, bridged, options_of, plane_bridged, sockets
 from places import ROOT
 from ports import free_port, is_free
 from synthetic import HEIGHT, WIDTH, plane_result, stream
@@ -24,12 +25,14 @@ from sags_node.messaging.sockets import Closes
 pytest.importorskip("foxglove", reason="no Foxglove without: pip install '.[bridges]'")
 pytest.importorskip("websockets", reason="no peer without the package websockets")
 
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from sags_node.clients.bridge.foxglove import CLICKED, FoxgloveOptions, clicked, outputs, run_foxglove
 from sags_node.clients.bridge.foxglove_layout import layout_of
 from sags_node.messaging import cdr, topics
+from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.subscriber import Subscriber
 
 pytestmark = pytest.mark.live
@@ -38,7 +41,7 @@ SUBPROTOCOL = "foxglove.sdk.v1"
 MESSAGE_DATA = 1  # opcode
 SEQUENCE_PARAMETERS = 7  # type of the H.264 unit that a key image begins with here
 KEY_EVERY = 30  # images
-FRAME_TOPICS = [topic.name for topic in topics.TOPICS if topic.name != "parameters"]
+RARE = ("/sags/status", "/sags/diagnostics")
 options = partial(options_of, FoxgloveOptions, port=0)
 
 
@@ -98,22 +101,38 @@ class Client(Closes):
         self._thread.join(60)
 
 
-def ros(joined: Client, name: str, number: int = -1) -> Any:
-    """The ROS message that came on a channel, read by its own schema's name."""
-    return cdr.decode(joined.came[name][number][1], joined.channels[name]["schemaName"])
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("run")
 
 
-def test_every_topic_comes_byte_for_byte_with_its_schema(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def plane(place: Path) -> Iterator[tuple[Publisher, int]]:
+    """A node that sends the plane, and the port of a bridge to it."""
+    with plane_bridged(run_foxglove, options(place)) as both:
+        yield both
+
+
+@pytest.fixture
+def port(plane: tuple[Publisher, int]) -> int:
+    return plane[1]
+
+
+def ros(joined: Client, name: str) -> Any:
+    """The newest ROS message of a channel, read by its own schema's name."""
+    return cdr.decode(joined.came[name][-1][1], joined.channels[name]["schemaName"])
+
+
+def told(joined: Client, words: str) -> bool:
+    return any(words in said.get("message", "").lower() for said in joined.said)
+
+
+def test_every_topic_comes_byte_for_byte_with_its_schema(port: int, place: Path) -> None:
     names = [f"/sags/{name}" for name in FRAME_TOPICS]
-    with plane_bridged(run_foxglove, options(tmp_path)) as (_, port), Client(port) as joined:
+    with Client(port) as joined:
         joined.subscribe(*names)
-        with Subscriber(FRAME_TOPICS, run_dir=tmp_path) as beside:
-            until(
-                lambda: all(
-                    len(joined.came[name]) > (0 if name in ("/sags/status", "/sags/diagnostics") else 8)
-                    for name in names
-                )
-            )
+        with Subscriber(FRAME_TOPICS, run_dir=place) as beside:
+            until(lambda: all(len(joined.came[name]) > 8 * (name not in RARE) for name in names))
             until(lambda: all(beside.latest(name) is not None for name in FRAME_TOPICS))
             newest = {name: beside.latest(name) for name in FRAME_TOPICS}
             kept = {(name, m.stamp_ns): m.cdr() for name, m in newest.items() if m is not None}
@@ -135,69 +154,54 @@ def test_every_topic_comes_byte_for_byte_with_its_schema(tmp_path: Path) -> None
     assert np.array_equal(picture.data.reshape(HEIGHT, WIDTH, 3), plane_result().pair.left)
 
 
-def test_only_what_is_looked_at_is_asked_of_the_node(tmp_path: Path) -> None:
-    with plane_bridged(run_foxglove, options(tmp_path)) as (running, port):
-        time.sleep(0.4)
-        assert [name for name in FRAME_TOPICS if running.wanted(name)] == ["status"]
-        with Client(port) as joined:
-            joined.subscribe("/sags/anchors")
-            until(lambda: joined.came["/sags/anchors"])
-            assert [name for name in FRAME_TOPICS if running.wanted(name)] == ["anchors", "status"]
-        until(lambda: not running.wanted("anchors"))
+def test_only_what_is_looked_at_is_asked_of_the_node(plane: tuple[Publisher, int]) -> None:
+    running, port = plane
+    until(lambda: asked(running) == {"status"})
+    with Client(port) as joined:
+        joined.subscribe("/sags/anchors")
+        until(lambda: asked(running) == {"anchors", "status"})
+    until(lambda: asked(running) == {"status"})
 
 
 def test_what_stops_is_empty_and_comes_back(tmp_path: Path) -> None:
+    """An age that grows is told once a second."""
+
+    def ages() -> list[float]:
+        found = (re.search(r"too old: ([\d.]+) s", said.get("message", "")) for said in joined.said)
+        return [float(age[1]) for age in found if age is not None]
+
     image, depth, anchors = "/sags/left/render/image", "/sags/left/render/depth", "/sags/anchors"
     with bridged(run_foxglove, options(tmp_path)) as port, Client(port) as joined:
         joined.subscribe(image, depth, anchors)
-        until(lambda: any("no node" in said.get("message", "").lower() for said in joined.said))
+        until(lambda: told(joined, "no node"))
         with sockets(tmp_path) as running:
             with stream(running, anchored_at):
                 until(lambda: all(joined.came[name] for name in (image, depth, anchors)))
             until(lambda: not ros(joined, image).data.any())
             until(lambda: np.isnan(ros(joined, depth).data.view(np.float32)).all())
             until(lambda: ros(joined, anchors).width == 0)
-            until(lambda: any("too old" in said.get("message", "") for said in joined.said))
             counts = {name: len(joined.came[name]) for name in (image, depth, anchors)}
-            time.sleep(0.3)
+            before = len(ages())  # which one after the other has become too old
+            until(lambda: len(ages()) > before + 2)
+            assert np.diff(ages()[before:]).min() > 0.9
             assert counts == {name: len(joined.came[name]) for name in counts}, "nothing more comes"
         with sockets(tmp_path) as running, stream(running, anchored_at):  # another node, on other ports
             until(lambda: ros(joined, image).data.any() and ros(joined, anchors).width == 4)
             until(lambda: joined.said[-1]["op"] == "removeStatus")
 
 
-def test_who_comes_later_is_told_what_is_missing_too(tmp_path: Path) -> None:
-    with bridged(run_foxglove, options(tmp_path)) as port, Client(port) as first:
-        first.subscribe("/sags/tf")
-        until(lambda: first.said)
-        with Client(port) as second:
-            second.subscribe("/sags/tf")
-            until(lambda: any("no node" in said.get("message", "").lower() for said in second.said))
-
-
 def test_who_looks_at_everything_is_told_at_once_what_is_missing_and_stays(tmp_path: Path) -> None:
-    """The server disconnects a client for which more statuses wait than there are channels."""
-    with bridged(run_foxglove, options(tmp_path)) as port, Client(port) as first, Client(port) as second:
-        for each in (first, second):
-            until(lambda each=each: "/sags/figures" in each.channels)
-            each.subscribe(*each.channels)
-            until(lambda each=each: each.said)
+    """So is who comes later. The server disconnects a client for which more statuses wait than there are
+    channels."""
+    with bridged(run_foxglove, options(tmp_path)) as port, ExitStack() as stack:
+        both = []
+        for _ in range(2):
+            both.append(joined := stack.enter_context(Client(port)))
+            joined.subscribe("/sags/figures")  # waits for the channels
+            joined.subscribe(*joined.channels.keys() - {"/sags/figures"})
+            until(lambda: told(both[-1], "no node"))
         with sockets(tmp_path) as running, stream(running, anchored_at):
-            until(lambda: first.came["/sags/tf"] and second.came["/sags/tf"])
-
-
-def test_an_age_that_grows_is_told_once_a_second(tmp_path: Path) -> None:
-    def ages() -> list[float]:
-        told = (re.search(r"too old: ([\d.]+) s", said.get("message", "")) for said in joined.said)
-        return [float(age[1]) for age in told if age is not None]
-
-    with sockets(tmp_path) as running, bridged(run_foxglove, options(tmp_path)) as port:
-        with Client(port) as joined:
-            joined.subscribe("/sags/anchors")
-            with stream(running, anchored_at):
-                until(lambda: joined.came["/sags/anchors"])
-            until(lambda: len(ages()) > 2)
-    assert np.diff(ages()).min() > 0.9
+            until(lambda: all(each.came["/sags/tf"] for each in both))
 
 
 def test_without_pyav_there_is_no_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -217,13 +221,9 @@ def test_a_bridge_that_is_started_anew_goes_on_on_the_same_port(tmp_path: Path) 
             until(lambda: is_free(port))  # a server of the SDK ends a moment after it was stopped
 
 
-def test_a_client_that_does_not_read_holds_nobody_up_and_goes_on_with_what_is_new(tmp_path: Path) -> None:
+def test_a_client_that_does_not_read_holds_nobody_up_and_goes_on_with_what_is_new(port: int) -> None:
     name = "/sags/left/render/image"
-    with (
-        plane_bridged(run_foxglove, options(tmp_path)) as (_, port),
-        Client(port) as quick,
-        Client(port) as slow,
-    ):
+    with Client(port) as quick, Client(port) as slow:
         for each in (quick, slow):
             each.subscribe(name)
             until(lambda each=each: each.came[name])
@@ -235,32 +235,39 @@ def test_a_client_that_does_not_read_holds_nobody_up_and_goes_on_with_what_is_ne
         until(lambda: slow.came[name][-1][0] > newest)
 
 
-def test_pictures_come_as_h264_that_anybody_can_begin_with(tmp_path: Path) -> None:
+def video(joined: Client, name: str) -> list[Any]:
+    """What came, read by the schema that the channel names."""
+    pool, channel = descriptor_pool.DescriptorPool(), joined.channels[name]
+    for file in descriptor_pb2.FileDescriptorSet.FromString(base64.b64decode(channel["schema"])).file:
+        pool.Add(file)
+    kind = message_factory.GetMessageClass(pool.FindMessageTypeByName(channel["schemaName"]))
+    return [kind.FromString(message) for _, message in joined.came[name]]
+
+
+def test_pictures_come_as_h264_that_anybody_can_begin_with(port: int) -> None:
     av = pytest.importorskip("av", reason="no H.264 without PyAV")
-    name = "/sags/left/image_rect_color/h264"
-    truth = plane_result().pair.left
-    with plane_bridged(run_foxglove, options(tmp_path)) as (_, port):
-        with Client(port) as first:
-            first.subscribe(name)
-            until(lambda: len(first.came[name]) > 5)
-            with Client(port) as second:
-                second.subscribe(name)
-                until(lambda: len(second.came[name]) > KEY_EVERY)
-                schema = base64.b64decode(second.channels[name]["schema"])
-                assert second.channels[name]["schemaName"] == "foxglove.CompressedVideo" and schema
-    fields = [protobuf_bytes(message) for _, message in second.came[name]]
-    assert all(each[4] == b"h264" and each[3].startswith(b"\x00\x00\x00\x01") for each in fields)
+    name, right = (f"/sags/{eye}/image_rect_color/h264" for eye in ("left", "right"))
+    with Client(port) as first, Client(port) as second:
+        first.subscribe(name)
+        until(lambda: len(first.came[name]) > 5)
+        second.subscribe(name, right)
+        until(lambda: len(second.came[name]) > KEY_EVERY and second.came[right])
+        assert second.channels[name]["schemaName"] == "foxglove.CompressedVideo"
+    fields = video(second, name)
+    assert {each.frame_id for each in fields} == {"left_optical_frame"}
+    assert video(second, right)[0].frame_id == "right_optical_frame"
+    assert all(each.format == "h264" and each.data.startswith(b"\x00\x00\x00\x01") for each in fields)
     # An image may go out while the server is still telling that somebody came.
-    began = next(n for n, each in enumerate(fields) if each[3][4] & 31 == SEQUENCE_PARAMETERS)
+    began = next(n for n, each in enumerate(fields) if each.data[4] & 31 == SEQUENCE_PARAMETERS)
     assert began < KEY_EVERY / 3, "it is not left to wait for the next key image"
     decoder, pictures = av.CodecContext.create("h264", "r"), []
     for each in fields[began : began + 6]:
-        pictures += decoder.decode(av.Packet(each[3]))
+        pictures += decoder.decode(av.Packet(each.data))
     assert len(pictures) == 6, "an image for each message from then on"
-    error = np.abs(pictures[-1].to_ndarray(format="rgb24").astype(int) - truth)
+    error = np.abs(pictures[-1].to_ndarray(format="rgb24").astype(int) - plane_result().pair.left)
     assert np.median(error) <= 12  # colour at half size, in an image whose colour changes with every pixel
     raw = WIDTH * HEIGHT * 3
-    assert np.mean([len(message) for _, message in second.came[name][began + 1 : began + 6]]) < raw / 10
+    assert np.mean([len(each.data) for each in fields[began + 1 : began + 6]]) < raw / 10
 
 
 @pytest.mark.fault("image: what is unsure, or not drawn, in H.264")
@@ -277,42 +284,8 @@ def test_h264_shows_what_has_alpha_over_black() -> None:
         assert np.abs(middle - alpha * color).max() <= 6  # of 255: coding
 
 
-@pytest.mark.parametrize("eye", ["left", "right"])
-def test_h264_is_in_the_frame_of_its_eye(tmp_path: Path, eye: str) -> None:
-    pytest.importorskip("av", reason="no H.264 without PyAV")
-    name = f"/sags/{eye}/render/image/h264"
-    with plane_bridged(run_foxglove, options(tmp_path)) as (_, port), Client(port) as joined:
-        joined.subscribe(name)
-        until(lambda: joined.came[name])
-    assert protobuf_bytes(joined.came[name][0][1])[2].decode() == f"{eye}_optical_frame"
-
-
-def protobuf_bytes(message: bytes) -> dict[int, bytes]:
-    """The fields of a protobuf message that hold bytes."""
-    fields, at = {}, 0
-
-    def number() -> int:
-        nonlocal at
-        value = shift = 0
-        while True:
-            byte = message[at]
-            at += 1
-            value |= (byte & 127) << shift
-            shift += 7
-            if byte < 128:
-                return value
-
-    while at < len(message):
-        key = number()
-        assert key & 7 == 2, "only fields with a length"
-        size = number()
-        fields[key >> 3] = message[at : at + size]
-        at += size
-    return fields
-
-
-def test_status_comes_as_figures_for_plots(tmp_path: Path) -> None:
-    with plane_bridged(run_foxglove, options(tmp_path)) as (_, port), Client(port) as joined:
+def test_status_comes_as_figures_for_plots(port: int) -> None:
+    with Client(port) as joined:
         joined.subscribe("/sags/figures")
         until(lambda: joined.came["/sags/figures"])
     said = json.loads(joined.came["/sags/figures"][-1][1])
@@ -333,27 +306,22 @@ def click(joined: Client, frame: str = "world") -> None:
 
 
 def test_a_click_pins_an_anchor_where_that_is_allowed(tmp_path: Path) -> None:
-    pinned: list[dict[str, Any]] = []
-
-    def add(args: dict[str, Any]) -> dict[str, Any]:
-        pinned.append(args)
-        return {"id": 1, "frame_id": 7, "depth_confidence": 0.9}
-
-    with sockets(tmp_path, {"add_anchor": add}) as running, stream(running):
+    pinned = Pinned()
+    with sockets(tmp_path, pinned.handlers) as running, stream(running):
         with bridged(run_foxglove, options(tmp_path, pin=True)) as port, Client(port) as joined:
             until(lambda: joined.info)
             assert joined.info["capabilities"] == ["clientPublish"]
             click(joined, frame="left_optical_frame")
-            until(lambda: any("'world'" in said.get("message", "") for said in joined.said))
+            until(lambda: told(joined, "'world'"))
             click(joined)
-            until(lambda: pinned)
-            until(lambda: any("depth_confidence" in said.get("message", "") for said in joined.said))
-        assert pinned == [{"x": 0.01, "y": 0.02, "z": 0.07}]
+            until(lambda: pinned.added)
+            until(lambda: told(joined, "depth_confidence"))
+        assert pinned.added == [{"x": 0.01, "y": 0.02, "z": 0.07}]
         with bridged(run_foxglove, options(tmp_path)) as port, Client(port) as joined:
             click(joined)
             joined.subscribe("/sags/tf")
             until(lambda: len(joined.came["/sags/tf"]) > 10)
-    assert len(pinned) == 1, "nobody may without --pin"
+    assert len(pinned.added) == 1, "nobody may without --pin"
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import refused
 from gstreamer import need_gstreamer
 from waiting import beside, repeating, until
 
@@ -98,7 +97,3 @@ def test_a_wrong_pipeline_is_said_in_words(tmp_path: Path) -> None:
         with pytest.raises(SagsError, match='no element "nosuchsink"'):
             run_gst(options, lambda: None, stop)
     assert not stop.is_set()
-
-
-def test_without_an_eye_it_says_what_to_give() -> None:
-    refused(2, "bridge", "gst", said=("--left", "--right"))

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bridging import HIDDEN, LOST, SEEN, UNSURE, anchored_at, bridged, options_of, plane_bridged, sockets
+from bridging import Pinned, anchored_at, asked, bridged, options_of, plane_bridged, sockets
 from igtl_peer import PEER, Peer, built
-from synthetic import HEIGHT, WIDTH, at_frame, plane_camera, plane_result, stream
+from synthetic import DISTANCE, HEIGHT, NORMAL, WIDTH, at_frame, plane_camera, plane_result, stream
 from waiting import until
 
 pytest.importorskip("pyigtl", reason="no OpenIGTLink without: pip install '.[bridges]'")
@@ -34,6 +34,7 @@ from sags_node.types import FrameResult
 pytestmark = pytest.mark.live
 
 RECEIVE_CLIENT = Path("/usr/share/doc/openigtlink-examples/examples/Receiver/ReceiveClient.cxx")
+SEEN, HIDDEN, LOST, UNSURE = anchored_at(0).anchors.ids.tolist()
 RAS = np.diag([-1.0, -1.0, 1.0])
 EXAMPLE_SAYS = (
     *(f"({WIDTH}, {HEIGHT}, 1)", "SagsPicture", "Receiving TRANSFORM data type.", "Receiving : POLYDATA"),
@@ -56,6 +57,14 @@ def weighted(picture: np.ndarray) -> int:
 
 def matrix(fields: list[str]) -> np.ndarray:
     return np.array(fields, np.float64).reshape(3, 4)
+
+
+def in_camera(surface: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Its corners [N, 3], mm in the camera's frame, and its triangles [M, 3]."""
+    corners, triangles = int(surface[0]), int(surface[1])
+    places = np.array([corner.split(";") for corner in surface[2 : 2 + corners]], np.float64)
+    moved = transform(invert(plane_camera().T_world_cam), places @ RAS * 1e-3) * 1e3
+    return moved, np.array(surface[2 + corners :], int).reshape(triangles, 3)
 
 
 @contextmanager
@@ -94,23 +103,17 @@ def test_every_device_says_in_millimetres_what_the_node_says(tmp_path: Path, pro
         T[:, :3] @ (RAS @ point * 1e3) + T[:, 3], RAS @ transform(camera.T_world_cam, point) * 1e3, atol=1e-3
     )
 
-    said = {
-        point.split(";")[0]: point.split(";")[1:]
-        for point in " ".join(anchors).replace("anchor ", "anchor-").split()
-    }
+    points = " ".join(anchors).replace("anchor ", "anchor-").split()
+    said = {name: fields for name, *fields in (point.split(";") for point in points)}
     names = [f"anchor-{number}" for number in (SEEN, UNSURE, HIDDEN)]
     assert said.keys() == set(names), f"{LOST} is lost: it has no place"
     assert np.allclose([float(x) for x in said[f"anchor-{SEEN}"][:3]], [-10, -20, 70], atol=1e-3)
     greens = [int(said[name][3]) for name in names]
     assert greens[0] > greens[1] > greens[2], "green where it is seen, orange where it may be elsewhere"
 
-    corners, triangles = int(surface[0]), int(surface[1])
-    places = np.array([corner.split(";") for corner in surface[2 : 2 + corners]], np.float64)
-    normal, distance = np.array([-0.2, 0.1, 1.0]), 60.0  # of the plane, camera, mm
-    in_camera = transform(invert(camera.T_world_cam), places @ RAS * 1e-3) * 1e3
-    assert corners > 60 and np.allclose(in_camera @ normal, distance, atol=0.01)
-    joined_corners = np.array(surface[2 + corners :], int).reshape(triangles, 3)
-    a, b, c = (in_camera[joined_corners[:, i]] for i in range(3))
+    corners, triangles = in_camera(surface)
+    assert len(corners) > 60 and np.allclose(corners @ NORMAL, 1e3 * DISTANCE, atol=0.01), "on the plane"
+    a, b, c = (corners[triangles[:, i]] for i in range(3))
     assert (np.cross(b - a, c - a)[:, 2] < 0).all(), "every triangle turns its front to the camera"
 
 
@@ -144,13 +147,10 @@ def test_a_surface_has_holes_where_the_depth_is_not_sure_or_jumps(tmp_path: Path
     torn = replace(plane, views=plane.views | {"left": replace(view, depth=depth, confidence=confidence)})
     with joined_to(program, options(tmp_path, send=("surface",), surface_step=8), torn) as joined:
         surface = until(lambda: joined.newest("SagsSurface"))
-    corners = int(surface[0])
-    camera = plane_camera()
-    places = np.array([corner.split(";") for corner in surface[2 : 2 + corners]], np.float64) @ RAS * 1e-3
-    in_camera = transform(invert(camera.T_world_cam), places)
-    columns = in_camera[:, 0] / in_camera[:, 2] * camera.K[0, 0] + camera.K[0, 2]
+    corners, triangles = in_camera(surface)
+    K = plane_camera().K
+    columns = corners[:, 0] / corners[:, 2] * K[0, 0] + K[0, 2]
     assert (columns < 2 * WIDTH / 3).all() and (columns < WIDTH / 3).any() and (columns > WIDTH / 3).any()
-    triangles = np.array(surface[2 + corners :], int).reshape(-1, 3)
     left = columns[triangles] < WIDTH // 3
     assert (left.all(axis=1) | ~left.any(axis=1)).all(), "no triangle spans the step"
 
@@ -224,66 +224,47 @@ def test_who_takes_nothing_gives_its_place_up(monkeypatch: pytest.MonkeyPatch) -
         until(lambda: len(peers) == MOST_PEERS)
         peers.send("SagsPicture", bytes(64 << 20))  # more than a kernel holds
         until(lambda: len(peers) == 0)
+    peers.send("SagsAnswer", b"late")  # as the requests' thread may while the bridge ends: it goes nowhere
 
 
-def test_nothing_is_asked_of_the_node_while_nobody_is_connected(tmp_path: Path, program: Path) -> None:
-    asked = ("left/image_rect_color", "left/render/image", "left/render/depth", "anchors", "tf")
-    with plane_bridged(run_openigtlink, options(tmp_path, send=("picture", "anchors"))) as (running, port):
+def test_only_what_is_looked_at_and_due_is_asked_of_the_node(tmp_path: Path, program: Path) -> None:
+    sent = options(tmp_path, send=("picture", "anchors", "surface"), surface_rate=0.5)
+    of_frames = {"left/image_rect_color", "left/render/image", "left/render/depth", "anchors", "tf"}
+    with plane_bridged(run_openigtlink, sent) as (running, port):
+        until(lambda: "status" in asked(running))
         time.sleep(0.5)
-        assert not any(running.wanted(name) for name in asked)
+        assert not asked(running) & of_frames
         with Peer(program, port) as joined:
-            until(lambda: joined.newest("SagsPicture"))
-            assert [name for name in asked if running.wanted(name)] == ["left/image_rect_color", "anchors"]
-        until(lambda: not any(running.wanted(name) for name in asked))
-
-
-def test_depth_is_asked_for_only_when_a_surface_is_due(tmp_path: Path, program: Path) -> None:
-    asked = options(tmp_path, send=("surface",), surface_rate=0.5)
-    with plane_bridged(run_openigtlink, asked) as (running, port):
-        with Peer(program, port) as joined:
-            until(lambda: joined.newest("SagsSurface"))
-            until(lambda: not running.wanted("left/render/depth"))
-            assert running.wanted("tf"), "it tells that the node goes on"
+            until(lambda: joined.newest("SagsPicture") and joined.newest("SagsSurface"))
+            # Depth only when a surface is due: between two `tf` tells that the node goes on.
+            until(lambda: asked(running) & of_frames == {"left/image_rect_color", "anchors", "tf"})
+        until(lambda: not asked(running) & of_frames)
 
 
 # ---- requests --------------------------------------------------------------------------------------------
 
 
-class Node:
-    """The control operations that bridges use."""
-
-    def __init__(self) -> None:
-        self.pinned: list[dict[str, Any]] = []
-        self.removed: list[int] = []
-
-    @property
-    def handlers(self) -> dict[str, Any]:
-        return {"add_anchor": self.add, "remove_anchor": self.remove}
-
-    def add(self, args: dict[str, Any]) -> dict[str, Any]:
-        self.pinned.append(args)
-        return {"id": len(self.pinned), "frame_id": 7, "depth_confidence": 0.9}
-
-    def remove(self, args: dict[str, Any]) -> None:
-        self.removed.append(args["id"])
-
-
 def test_a_peer_pins_anchors_by_point_and_by_pixel(tmp_path: Path, program: Path) -> None:
-    node = Node()
+    node = Pinned()
     with plane_bridged(run_openigtlink, options(tmp_path), handlers=node.handlers) as (_, port):
         with Peer(program, port, "point", "SagsPin", -10, -20, 70) as joined:
-            until(lambda: node.pinned)
-            assert np.allclose([node.pinned[0][axis] for axis in "xyz"], [0.01, 0.02, 0.07])
+            until(lambda: node.added)
+            assert np.allclose([node.added[0][axis] for axis in "xyz"], [0.01, 0.02, 0.07])
             assert "depth_confidence" in " ".join(until(lambda: joined.newest("SagsAnswer")))
         with Peer(program, port, "point", "SagsPin", -10, -20, 70):  # the same list again: nothing new
             time.sleep(1.0)
         with Peer(program, port, "point", "SagsPin", -10, -20, 71):  # moved
-            until(lambda: len(node.pinned) == 2 and node.removed == [1])
+            until(lambda: len(node.added) == 2 and node.removed == [1])
         with Peer(program, port, "say", "SagsRequest", "pin 320 256.5"):
-            until(lambda: len(node.pinned) == 3)
+            until(lambda: len(node.added) == 3)
         with Peer(program, port, "say", "SagsRequest", "dance"):
             pass
-    assert node.pinned[2] == {"u": 320.0, "v": 256.5}
+    assert node.added[2] == {"u": 320.0, "v": 256.5}
+
+
+def dialled(port: int) -> socket.socket:
+    """A peer of plain bytes."""
+    return socket.create_connection(("127.0.0.1", port), timeout=60)
 
 
 def points(*places: tuple[float, float, float]) -> bytes:
@@ -296,19 +277,16 @@ def points(*places: tuple[float, float, float]) -> bytes:
 def test_anchors_of_a_node_that_was_restarted_are_left_to_whoever_has_their_numbers(
     tmp_path: Path, program: Path, connected: bool
 ) -> None:
-    before, after = Node(), Node()
+    before, after = Pinned(), Pinned()
     with bridged(run_openigtlink, options(tmp_path)) as port, Peer(program, port) as told:
-
-        def slicer() -> socket.socket:
-            return socket.create_connection(("127.0.0.1", port), timeout=60)
 
         def said(words: str) -> bool:
             return any(each[1] == "SagsAnswer" and words in " ".join(each) for each in told.came)
 
         with sockets(tmp_path, before.handlers) as running, stream(running, anchored_at):
-            peer = slicer()
+            peer = dialled(port)
             peer.sendall(points((0, 0, 80), (20, 0, 80)))
-            until(lambda: len(before.pinned) == 2 and said("'id': 2"))
+            until(lambda: len(before.added) == 2 and said("'id': 2"))
             if not connected:
                 peer.close()
                 told.close()
@@ -318,10 +296,10 @@ def test_anchors_of_a_node_that_was_restarted_are_left_to_whoever_has_their_numb
             else:
                 until(lambda: running.wanted("status"))
                 time.sleep(1.0)  # without a peer nothing tells when the bridge has seen it
-                peer = slicer()
+                peer = dialled(port)
             peer.sendall(points((0, 0, 80)))  # the other one is deleted
             peer.sendall(points((0, 0, 70)))  # and this one moved
-            until(lambda: len(after.pinned) == 1)
+            until(lambda: len(after.added) == 1)
             peer.sendall(points((0, 0, 60)))  # that anchor is this node's, and is given back
             until(lambda: after.removed)
             peer.close()
@@ -363,21 +341,20 @@ def test_strangers_are_cut_off_and_disturb_nobody(tmp_path: Path, program: Path)
             large,
             b"\xff" * 4096,
         ):
-            with socket.create_connection(("127.0.0.1", port), timeout=60) as stranger:
+            with dialled(port) as stranger:
                 stranger.sendall(attack)
-                stranger.settimeout(60)
                 with pytest.raises((ConnectionError, EOFError)):
                     while stranger.recv(1 << 16):
                         pass
                     raise EOFError
-        with socket.create_connection(("127.0.0.1", port), timeout=60) as stranger:
+        with dialled(port) as stranger:
             stranger.sendall(damaged)  # passed over
             assert stranger.recv(10)
-        crowd = [socket.create_connection(("127.0.0.1", port), timeout=60) for _ in range(20)]
-        before = len(joined.came)
-        until(lambda: len(joined.came) > before + 20)
-        for stranger in crowd:
-            stranger.close()
+        with ExitStack() as crowd:
+            for _ in range(20):
+                crowd.enter_context(dialled(port))
+            before = len(joined.came)
+            until(lambda: len(joined.came) > before + 20)
 
 
 def test_points_that_are_named_alike_are_all_pinned_and_given_back() -> None:
@@ -387,14 +364,6 @@ def test_points_that_are_named_alike_are_all_pinned_and_given_back() -> None:
     assert [(pin.name, pin.place.tolist()) for pin in due] == [("vessel", each.tolist()) for each in places]
     assert not any(pins.pinned(pin, anchor) for anchor, pin in enumerate(due, 7))
     assert pins.hear([("vessel", places[0])], 2.0) == [8] and pins.due(3.0) == []
-
-
-def test_an_answer_that_comes_after_the_end_goes_nowhere() -> None:
-    """The requests' thread may still say something while the bridge ends."""
-    peers = Peers(socket.create_server(("127.0.0.1", 0)), lambda _: None, lambda: None)
-    peers.start()
-    peers.close()
-    peers.send("SagsAnswer", b"late")
 
 
 def test_a_taken_port_and_an_unknown_output_are_said(tmp_path: Path) -> None:

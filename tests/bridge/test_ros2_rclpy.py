@@ -9,11 +9,12 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from bridging import anchored, bridged, senders, sockets
+from bridging import anchored, bridged, options_of, sockets
 from command_line import killed, start
 from places import ROOT, SESSION
 from ros_peers import DOMAIN, LARGE_BUFFERS, Listener, RosNode, rclpy_python, ros_node
@@ -41,8 +42,7 @@ def _rclpy() -> None:
     rclpy_python()
 
 
-def options(run_dir: Path) -> Ros2Options:
-    return Ros2Options(**senders(run_dir), graph=RosGraph(domain=DOMAIN))
+options = partial(options_of, Ros2Options, graph=RosGraph(domain=DOMAIN))
 
 
 def checksum(message: Received) -> int:

@@ -17,18 +17,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import pytest
-from bridging import (
-    HIDDEN,
-    LOST,
-    SEEN,
-    UNSURE,
-    anchored,
-    anchored_at,
-    bridged,
-    options_of,
-    plane_bridged,
-    sockets,
-)
+from bridging import anchored, anchored_at, bridged, options_of, plane_bridged, sockets
 from browsers import new_page
 from places import ROOT
 from synthetic import HEIGHT, WIDTH, at_frame, plane_result, stream
@@ -95,6 +84,13 @@ def told(joined: ClientConnection, seconds: float = 60.0) -> dict[str, Any]:
     return json.loads(next(said_as(str, joined, seconds)))
 
 
+@pytest.fixture(scope="module")
+def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
+    """The port of a gateway to a node that sends the plane."""
+    with plane_bridged(run_web, options(tmp_path_factory.mktemp("run"))) as (_, port):
+        yield port
+
+
 def test_messages_are_the_nodes_own(tmp_path: Path) -> None:
     thin = "sags/thin/half/left/render/depth/png"
     with (
@@ -118,8 +114,8 @@ def test_what_stops_is_taken_back_with_the_reason(tmp_path: Path) -> None:
         with sockets(tmp_path) as running:
             with stream(running, anchored_at):
                 next_of(joined, DEPTH)
-            said = [told(joined)]
-            assert said[0]["topic"] == DEPTH and "too old" in said[0]["stale"]
+            last = told(joined)
+            assert last["topic"] == DEPTH and "too old" in last["stale"]
             with stream(running, anchored_at):
                 next_of(joined, DEPTH)
 
@@ -201,13 +197,6 @@ def test_who_reads_slowly_misses_some_and_nobody_waits_for_him(
             head, _ = next_of(late, IMAGE)
             came.append(head["seq"])
         assert len(came) < 0.8 * (came[-1] - came[0]), "some were left out"
-
-
-@pytest.fixture
-def web(tmp_path: Path) -> Iterator[int]:
-    """The port of a gateway to a node that sends the plane."""
-    with plane_bridged(run_web, options(tmp_path)) as (_, port):
-        yield port
 
 
 # ---- the page ----------------------------------------------------------------------------------------------
@@ -334,6 +323,7 @@ def test_the_example_shows_the_model_in_a_page_of_its_own(page: Any, tmp_path: P
                 page.goto(f"{site}/?from=ws://127.0.0.1:{port}/ws")
                 until(lambda: pixels(page, "model").any())
                 told = until(lambda: page.text_content("#anchors"))
-                seen = f"{SEEN}: 20 20 px, {HIDDEN}: 50 30 px"
-                assert told == f"{seen}, {LOST}: not recognised, {UNSURE}: not recognised"
+                seen, hidden, lost, unsure = anchored().anchors.ids
+                places = f"{seen}: 20 20 px, {hidden}: 50 30 px"
+                assert told == f"{places}, {lost}: not recognised, {unsure}: not recognised"
         server.shutdown()

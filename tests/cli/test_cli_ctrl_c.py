@@ -29,18 +29,26 @@ pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 
 
 @pytest.mark.fault("process: Ctrl-C during a measurement")
-@pytest.mark.parametrize("command", [["eval", "--json"], ["eval", "--pace", "step"], ["demo", "--json"]])
-def test_ctrl_c_ends_a_measured_run(
-    command: list[str], phantom_session: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+@pytest.mark.parametrize(
+    ("command", "begun"),
+    [
+        ("eval --json SESSION source.rate:=2", "sags-eval-*/*.*"),
+        ("eval --pace step SESSION source.rate:=2", "sags-eval-*/*.*"),
+        ("demo --json --out OUT/demo SESSION source.rate:=2", "sags-eval-*/*.*"),
+        ("phantom OUT/session seconds:=60 width:=320 height:=256", ".sags-*/*/left/*.jpg"),
+    ],
+)
+def test_ctrl_c_ends_what_takes_long_and_leaves_nothing(
+    command: str, begun: str, phantom_session: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     temporary = tmp_path_factory.mktemp("t")  # short: a socket's path has at most 107 letters
-    if command[0] == "demo":
-        command = [*command, "--out", str(tmp_path / "demo")]
-    process = start([*command, phantom_session, "source.rate:=2"], TMPDIR=temporary)
-    wait_for(process, lambda: any(temporary.glob("sags-eval-*/*.*")))
+    words = command.replace("SESSION", str(phantom_session)).replace("OUT", str(tmp_path)).split()
+    process = start(words, TMPDIR=temporary)
+    wait_for(process, lambda: any(temporary.glob(begun)) or any(tmp_path.glob(begun)))
     stdout, stderr = stopped(process)
-    assert process.returncode == 130 and "stopped" in stderr and stdout == ""
-    assert not any(temporary.iterdir())
+    assert process.returncode == 130 and "stopped" in stderr
+    assert stdout == "" and not any(temporary.iterdir())
+    assert all(path.name == "demo" for path in tmp_path.iterdir()), "but the folder that was asked for"
 
 
 def test_a_ctrl_c_that_comes_while_a_kernel_is_loaded_is_one_too(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -223,14 +231,6 @@ def test_a_thread_that_is_given_up_does_not_abort_the_process() -> None:
         [sys.executable, "-c", BROKEN_OFF], capture_output=True, text=True, timeout=START_SECONDS, check=False
     )
     assert (ended.returncode, ended.stdout, ended.stderr) == (7, "said", "")
-
-
-def test_ctrl_c_ends_the_rendering_of_a_phantom(tmp_path: Path) -> None:
-    process = start(["phantom", tmp_path / "session", "seconds:=60", "width:=320", "height:=256"])
-    wait_for(process, lambda: any(tmp_path.glob(".sags-*/*/left/*.jpg")))
-    stopped(process)
-    assert process.returncode == 130
-    assert not any(tmp_path.iterdir())
 
 
 @pytest.fixture

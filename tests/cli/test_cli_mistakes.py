@@ -3,16 +3,24 @@
 import errno
 import json
 import os
+import shlex
 from pathlib import Path
 from typing import Any
 
 import pytest
-from command_line import RUN_HERE, refused, sags, start
+from command_line import refused, sags, start
 from places import ROOT
-from user_files import SHORT, videos
+from user_files import SHORT, videos, words_of
 from waiting import START_SECONDS
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
+
+LAUNCH = ROOT / "launch"
+
+
+def named(rows: list[Any]) -> list[Any]:
+    """Rows of a table by their commands."""
+    return [pytest.param(*row[:2], row[2:], id=row[0].replace(str(ROOT), "")) for row in rows]
 
 
 # ---- launch files and overrides --------------------------------------------------------------------------
@@ -20,131 +28,142 @@ pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 
 @pytest.mark.parametrize("command", ["run", "demo", "eval", "doctor"])
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("launch", "said"),
     [
-        (["nowhere.yaml"], ("nowhere.yaml", "No such file", "check the path")),
-        (["[/bold]:x:.yaml"], ("[/bold]:x:.yaml", "check the path")),  # no markup and no emoji of rich
-        ([f"{ROOT}/launch/d4d_pul.yaml"], ("No such file", f"did you mean {ROOT}/launch/d4d_pull.yaml?")),
-        (["a.yaml", "b.yaml"], ("one launch file", "a.yaml, b.yaml", "sags new LEFT RIGHT")),
-        (["mapping.budgt_ms:=25"], ("mapping.budgt_ms", "did you mean 'budget_ms'")),
-        (["budget_ms:=25"], ("'budget_ms'", "did you mean 'mapping.budget_ms'")),
-        (["mapping.budget_ms:=soon"], ("mapping.budget_ms", "valid number", "'soon'")),
-        (["publish.data:=tcp://127.0.0.1:5"], ("publish.data", "a list", "'tcp://127.0.0.1:5'")),
-        (
-            ["source.kind:=videos", "source.left:=a.mp4"],
-            ("source.right is missing", "vision.onnx.declared_depth", "docs/networks.md"),
-        ),
-        (["clip.MP4"], ("clip.MP4 does not exist", "check the path")),
-        (["mapping.budget_ms=25"], ("'mapping.budget_ms=25'", "write mapping.budget_ms:=25")),
-        ([":=25"], ("':=25'", "write key:=value")),
+        ("nowhere.yaml", ("nowhere.yaml", "No such file", "check the path")),
+        ("[/bold]:x:.yaml", ("[/bold]:x:.yaml", "check the path")),  # no markup and no emoji of rich
+        (f"{LAUNCH}/d4d_pul.yaml", ("No such file", f"did you mean {LAUNCH}/d4d_pull.yaml?")),
+        ("a.yaml b.yaml", ("one launch file", "a.yaml, b.yaml", "sags new LEFT RIGHT")),
+        ("budget_ms:=25", ("'budget_ms'", "did you mean 'mapping.budget_ms'")),
+        ("source.kind:=videos source.left:=a.mp4",
+         ("source.right is missing", "vision.onnx.declared_depth", "docs/networks.md")),
+        ("clip.MP4", ("clip.MP4 does not exist", "check the path")),
+        ("mapping.budget_ms=25", ("'mapping.budget_ms=25'", "write mapping.budget_ms:=25")),
+        (":=25", ("':=25'", "write key:=value")),
     ],
-)
-def test_a_wrong_launch(command: str, arguments: list[str], said: tuple[str, ...]) -> None:
-    refused(2, command, *arguments, said=said)
+)  # fmt: skip
+def test_a_wrong_launch(command: str, launch: str, said: tuple[str, ...]) -> None:
+    refused(2, command, *launch.split(), said=said)
 
 
-def test_what_is_there_and_no_file_is_not_taken_for_a_slip_of_the_pen() -> None:
-    refused(2, "run", "/dev/null", said=("/dev/null: it is a device, no file; check the path",))
-
-
-@pytest.mark.parametrize("content", ["", "# source: {kind: videos}\n", "{}"])
-def test_a_launch_file_that_says_nothing_is_not_taken_for_the_phantom(tmp_path: Path, content: str) -> None:
-    (tmp_path / "mine.yaml").write_text(content)
-    refused(2, "run", tmp_path / "mine.yaml", said=("mine.yaml is empty", "write source:"))
-
-
-def test_a_folder_that_is_no_session(user_files: Path) -> None:
-    said = (f"{user_files / 'empty'} is an empty folder", "give the folder that holds the recording")
-    refused(2, "run", user_files / "empty", said=said)
+EMPTY = ("mine.yaml is empty", "write source:")
+NO_PHANTOM = ("FILES/calib", "built-in phantom", "name the launch file")
 
 
 @pytest.mark.parametrize(
-    ("overrides", "said"),
+    ("content", "overrides", "said"),
     [
-        (["mapping.bugdet_ms:=3"], "command line: unknown key 'mapping.bugdet_ms'"),
-        (["mapping.budget_ms:=soon"], "command line: mapping.budget_ms"),
-        (["mapping:={bugdet_ms: 3}"], "command line: unknown key 'mapping.bugdet_ms'"),
-        (["source.kind:=video"], "command line: source.kind: should be one of"),
-        ([], "mine.yaml: unknown key 'mapping.max_gausians'"),
-        (["mapping.budget_ms:=3"], "mine.yaml: unknown key 'mapping.max_gausians'"),
+        *(("mapping: {max_gaussians: 1000}", *row) for row in (
+            ("mapping.bugdet_ms:=3", ("command line: unknown key 'mapping.bugdet_ms'",)),
+            ("mapping.budget_ms:=soon", ("command line: mapping.budget_ms", "valid number", "'soon'")),
+            ("'mapping:={bugdet_ms: 3}'", ("command line: unknown key 'mapping.bugdet_ms'",)),
+            ("source.kind:=video", ("command line: source.kind: should be one of",)),
+        )),
+        ("mapping: {max_gausians: 1}", "", ("mine.yaml: unknown key 'mapping.max_gausians'",)),
+        ("mapping: {max_gausians: 1}", "mapping.budget_ms:=3", ("mine.yaml: unknown key",)),
+        ("mapping: {budget_ms: fast}\nvison: {}\n", "",  # every mistake is named
+         ("mine.yaml: mapping.budget_ms", "did you mean 'vision'")),
+        *((nothing, "", EMPTY) for nothing in ("", "# source: {kind: videos}\n", "{}")),
+        ("rig: FILES/calib", "", NO_PHANTOM),
     ],
-)
-def test_a_mistake_is_named_where_it_was_made(tmp_path: Path, overrides: list[str], said: str) -> None:
-    file = tmp_path / "mine.yaml"
-    file.write_text(
-        "mapping: {max_gaussians: 1000}" if "command line" in said else "mapping: {max_gausians: 1}"
-    )
-    refused(2, "run", file, *overrides, said=(said,))
-    if "command line" in said:
-        refused(2, "run", *overrides, said=(said,))
+)  # fmt: skip
+def test_a_mistake_is_named_where_it_was_made(
+    user_files: Path, tmp_path: Path, content: str, overrides: str, said: tuple[str, ...]
+) -> None:
+    """What says nothing, or no source, is not taken for the phantom."""
+    (tmp_path / "mine.yaml").write_text(content.replace("FILES", str(user_files)))
+    expected = tuple(words.replace("FILES", str(user_files)) for words in said)
+    refused(2, "run", tmp_path / "mine.yaml", *shlex.split(overrides), said=expected)
+    if "command line" in said[0]:
+        refused(2, "run", *shlex.split(overrides), said=expected)
 
 
-def test_a_calibration_is_not_taken_for_that_of_the_phantom(user_files: Path, tmp_path: Path) -> None:
-    """The launch file was forgotten, or names no source."""
-    rig = f"rig:={user_files / 'calib'}"
-    said = (str(user_files / "calib"), "built-in phantom", "name the launch file")
-    for command in ("run", "eval", "doctor"):
-        refused(2, command, rig, said=said)
-    (tmp_path / "mine.yaml").write_text(f"rig: {user_files / 'calib'}")
-    refused(2, "run", tmp_path / "mine.yaml", said=said)
+# ---- everything else -------------------------------------------------------------------------------------
+
+NOBODY = "no node runs as 'other'"
+LISTENERS = ("topic list", "topic echo tf", "topic hz tf", "topic bw tf", "topic delay tf")
+REFUSED = [  # command, exit code, what is said; FILES: of `write_user_files`; NEW: nothing is there
+    ("run /dev/null", 2, "/dev/null: it is a device, no file; check the path"),
+    ("run FILES/empty", 2, "FILES/empty is an empty folder", "give the folder that holds the recording"),
+    *((f"{command} rig:=FILES/calib", 2, *NO_PHANTOM) for command in ("run", "eval", "doctor")),
+    (f"run {LAUNCH}/v4l2.yaml source.left:=/dev/no-camera", 1, "/dev/no-camera", "does not exist"),
+    (f"demo {LAUNCH}/v4l2.yaml", 2, "plays recordings", "sags run"),
+    (f"eval {LAUNCH}/v4l2.yaml", 2, "live cameras", "record them first"),
+    ("calib check FILES/calib --images FILES/left.mp4 FILES/right.mp4", 2, "left.mp4 is a video",
+     "--session"),
+    ("calib check FILES/gone", 2, "gone/left.yaml"),
+    ("eval VIDEOS source.frames:=2 --pace step --lpips-weights gone.npz", 2, "no file of LPIPS weights at ",
+     "gone.npz"),
+    # Numbers out of range.
+    *((f"{command} {option} {number}", 2, option, "is not in the range") for command, option, number in (
+        ("run", "--seconds", 0), ("topic hz tf", "--seconds", -1), ("topic echo tf", "--count", 0),
+        ("bag record", "--max-cache", "inf"), ("bag play bag", "--start-offset", "nan"),
+        ("eval", "--every", 0), ("eval", "--hold-out", -1), ("eval", "--iterations", -1),
+    )),
+    # Topics to record are named by an option.
+    ("bag record left/render/depth", 2, "--topics left/render/depth; without --topics all are recorded"),
+    ("bag record --topics left/depth no_such", 2, "unknown topic 'no_such'"),
+    ("bag record --all --topics left/depth", 2, "--all or --topics, not both"),
+    ("bag record rig:=x", 2, "rig:=x: key:=value needs a recording"),
+    # What cannot be kept is noticed before the run.
+    *((f"eval nowhere.yaml {option} FILES/file/inside", 1, "cannot write FILES/file")
+      for option in ("--out", "--report")),
+    ("eval nowhere.yaml --out FILES/empty", 2, "empty", "is a directory"),
+    ("eval nowhere.yaml --report FILES/file", 1, "cannot write"),
+    ("demo --out FILES/file", 1, "cannot write"),
+    ("phantom FILES seconds:=0.1", 2, "FILES", "not empty", "another folder"),
+    ("phantom FILES/file", 2, "FILES/file", "exists"),
+    ("phantom FILES/file/new seconds:=0.1", 1, "cannot write FILES/file: "),
+    ("phantom NEW secnds:=1", 2, "secnds", "did you mean 'seconds'"),
+    ("phantom NEW kind:=v4l2", 2, "kind: ", "'phantom'", "v4l2"),
+    ("overlay --save NEW.avi", 2, "new.avi", ".mp4 or .png"),
+    ("overlay --save NEW/x.mp4", 2, "there is no folder", "new"),
+    # Beside no node.
+    *((f"{command} --ns other", 1, NOBODY, "/sags/other.json", "start one with: sags run")
+      for command in (*LISTENERS, "pause", "reset", "anchor list", "param get")),
+    ("overlay --ns other --seconds 0.3", 1, NOBODY, "waiting (Ctrl-C ends): "),
+    ("topic hz tf --endpoint nonsense", 1, "nonsense", "e.g. tcp://127.0.0.1:5556"),
+    ("bridge gst", 2, "--left", "--right"),
+]  # fmt: skip
 
 
-def test_what_is_played_is_said(user_files: Path) -> None:
-    played = ("source.frames:=2", "source.pace:=fast")
-    said = f"source: videos {user_files / 'left.mp4'}, {user_files / 'right.mp4'}"
-    assert said in sags("run", *videos(user_files), *played).stderr.splitlines()
-    assert said in sags("eval", *videos(user_files), *played[:1], "--pace", "step").stderr.splitlines()
-    small = ("source.width:=160", "source.height:=128", "source.seconds:=0.2")
-    phantom = sags("run", *small, *RUN_HERE, "source.loop:=false", *played)
-    assert "source: the built-in phantom" in phantom.stderr.splitlines()
-
-
-def test_every_mistake_of_a_launch_file_is_named(tmp_path: Path) -> None:
-    file = tmp_path / "two.yaml"
-    file.write_text("mapping: {budget_ms: fast}\nvison: {}\n")
-    refused(2, "run", file, said=("two.yaml: mapping.budget_ms", "did you mean 'vision'"))
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["run", "--seconds", "0"],
-        ["topic", "hz", "tf", "--seconds", "-1"],
-        ["topic", "echo", "tf", "--count", "0"],
-        ["bag", "record", "--max-cache", "inf"],
-        ["bag", "play", "bag", "--start-offset", "nan"],
-        ["eval", "--every", "0"],
-        ["eval", "--hold-out", "-1"],
-        ["eval", "--iterations", "-1"],
-    ],
-)
-def test_numbers_out_of_range(arguments: list[str]) -> None:
-    refused(2, *arguments, said=(arguments[-2], "is not in the range"))
-
-
-# ---- recordings and calibrations -------------------------------------------------------------------------
+@pytest.mark.parametrize(("command", "code", "said"), named(REFUSED))
+def test_a_mistake_is_one_message_and_changes_nothing(
+    user_files: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    command: str,
+    code: int,
+    said: tuple[str, ...],
+) -> None:
+    monkeypatch.setattr(os, "nice", lambda by: 0)  # this process goes on
+    words = words_of(command.replace("NEW", str(tmp_path / "new")), user_files)
+    refused(code, *words, said=tuple(each.replace("FILES", str(user_files)) for each in said))
+    assert (user_files / "file").read_text() == "mine" and not any((user_files / "empty").iterdir())
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.fault("calibration: missing, one eye only, in mm, of another size")
+@pytest.mark.parametrize("command", ["run", "eval --pace step"])
 @pytest.mark.parametrize(
-    ("code", "overrides", "said"),
+    ("overrides", "said"),
     [
-        (2, {"left": "gone.mp4"}, ("gone.mp4", "does not exist", "check the path")),
-        (2, {"left": "garbage.mp4"}, ("garbage.mp4", "cannot be read as a video")),
-        (2, {"right": "small.mp4"}, ("320x256", "160x128", "left.mp4", "small.mp4")),
-        (2, {"rig": "gone"}, ("gone/left.yaml", "a rig is a folder with left.yaml and right.yaml")),
-        (2, {"rig": "calb"}, ("no calibration", "did you mean /", "/calib?")),
-        (2, {"rig": "one_eyed"}, ("one_eyed/right.yaml", "No such file")),
-        (2, {"rig": "millimetres"}, ("millimetres", "projection_matrix[3]", "by 1000")),
-        (2, {"rig": "positive"}, ("projection_matrix[3]", "negative")),
-        (2, {"rig": "double"}, ("320x256", "640x512")),
+        ({"left": "gone.mp4"}, ("gone.mp4", "does not exist", "check the path")),
+        ({"left": "garbage.mp4"}, ("garbage.mp4", "cannot be read as a video")),
+        ({"right": "small.mp4"}, ("320x256", "160x128", "left.mp4", "small.mp4")),
+        ({"rig": "gone"}, ("gone/left.yaml", "a rig is a folder with left.yaml and right.yaml")),
+        ({"rig": "calb"}, ("no calibration", "did you mean /", "/calib?")),
+        ({"rig": "one_eyed"}, ("one_eyed/right.yaml", "No such file")),
+        ({"rig": "millimetres"}, ("millimetres", "projection_matrix[3]", "by 1000")),
+        ({"rig": "positive"}, ("projection_matrix[3]", "negative")),
+        ({"rig": "double"}, ("320x256", "640x512")),
     ],
+    ids=str,
 )
 def test_a_wrong_recording_or_calibration(
-    user_files: Path, code: int, overrides: dict[str, str], said: tuple[str, ...]
+    user_files: Path, command: str, overrides: dict[str, str], said: tuple[str, ...]
 ) -> None:
-    refused(code, "run", *videos(user_files, **overrides), said=said)
-    refused(code, "eval", "--pace", "step", *videos(user_files, **overrides), said=said)
+    refused(2, *command.split(), *videos(user_files, **overrides), said=said)
 
 
 @pytest.mark.parametrize("command", [["run"], ["import", "--check"], ["calib", "check"]])
@@ -162,12 +181,6 @@ def test_a_path_that_cannot_be_looked_up(command: list[str], monkeypatch: pytest
     refused(2, *command, "/private/case", said=("cannot open /private/case", "Permission denied"))
 
 
-def test_a_video_is_no_picture(user_files: Path) -> None:
-    pair = (user_files / "left.mp4", user_files / "right.mp4")
-    said = ("left.mp4 is a video", "--session")
-    refused(2, "calib", "check", user_files / "calib", "--images", *pair, said=said)
-
-
 def test_a_calibration_is_not_converted_onto_itself(user_files: Path, tmp_path: Path) -> None:
     rig = tmp_path / "rig"
     convert = ("calib", "convert", user_files / "calib", "-o", rig, "--scale", "2")
@@ -178,31 +191,11 @@ def test_a_calibration_is_not_converted_onto_itself(user_files: Path, tmp_path: 
     assert [(rig / f"{eye}.yaml").read_text() for eye in ("left", "right")] == before
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["left/render/depth"], "--topics left/render/depth; without --topics all are recorded"),
-        (["--topics", "left/depth", "no_such"], "unknown topic 'no_such'"),
-        (["--all", "--topics", "left/depth"], "--all or --topics, not both"),
-        (["rig:=x"], "rig:=x: key:=value needs a recording"),
-    ],
-)
-def test_topics_to_record_are_named_by_an_option(arguments: list[str], said: str) -> None:
-    refused(2, "bag", "record", *arguments, said=(said,))
-
-
 def test_no_library_adds_lines_of_its_own(user_files: Path) -> None:
     process = start(["run", *videos(user_files, left="garbage.mp4")])
     _, stderr = process.communicate(timeout=START_SECONDS)
     assert process.returncode == 2
     assert stderr == f"error: {user_files / 'garbage.mp4'} cannot be read as a video; is it complete?\n"
-
-
-def test_a_camera_that_is_not_there() -> None:
-    camera = "source.left:=/dev/no-camera"
-    refused(1, "run", ROOT / "launch/v4l2.yaml", camera, said=("/dev/no-camera", "does not exist"))
-    refused(2, "demo", ROOT / "launch/v4l2.yaml", said=("plays recordings", "sags run"))
-    refused(2, "eval", ROOT / "launch/v4l2.yaml", said=("live cameras", "record them first"))
 
 
 @pytest.mark.fault("file: the right eye's video is shorter")
@@ -219,8 +212,3 @@ def test_a_right_video_that_ends_too_early_is_refused_before_it_plays(
     assert sags("run", *session, f"source.frames:={SHORT}").exit_code == 0
     result = sags("eval", *session, f"source.frames:={SHORT}", *command[-6:])
     assert result.exit_code == 0 and json.loads(file.read_text())["processed"] == SHORT
-
-
-def test_lpips_weights_that_are_not_there(user_files: Path) -> None:
-    session = [*videos(user_files), "source.frames:=2", "--pace", "step", "--lpips-weights", "gone.npz"]
-    refused(2, "eval", *session, said=("no file of LPIPS weights at ", "gone.npz"))

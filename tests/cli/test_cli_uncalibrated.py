@@ -1,7 +1,6 @@
 """A recording that nobody has calibrated plays, and nothing of it passes for metres."""
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from sags_node.sources.source import recorded_rig
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 DEPTH, CONFIDENCE = (
-    TopicName(name, ReceivedImage) for name in ("left/render/depth", "left/render/depth_confidence")
+    TopicName(f"left/render/{name}", ReceivedImage) for name in ("depth", "depth_confidence")
 )
 CLOUDS = [TopicName(name, ReceivedCloud) for name in ("points", "splats", "anchors")]
 STATUS = TopicName("status", ReceivedText)
@@ -31,16 +30,11 @@ def two_videos(user_files: Path, tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.fixture
-def node(two_videos: Path, tmp_path: Path) -> Iterator[RunningNode]:
-    with RunningNode(two_videos, tmp_path) as running:
-        yield running
-
-
 def test_every_message_says_that_lengths_have_no_unit_and_none_is_sure(
-    node: RunningNode, tmp_path: Path
+    two_videos: Path, tmp_path: Path
 ) -> None:
     with (
+        RunningNode(two_videos, tmp_path) as node,
         ControlClient(run_dir=node.run_dir) as control,
         Subscriber([DEPTH, CONFIDENCE, *CLOUDS], run_dir=node.run_dir) as subscriber,
     ):
@@ -67,9 +61,9 @@ def test_every_message_says_that_lengths_have_no_unit_and_none_is_sure(
         assert [row["unit"] for row in listed] == [None]
         assert "x y z have no unit" in sags("anchor", "list", *ipc).stdout
         assert figures_of("topic", "echo", str(DEPTH), "--once", *ipc, "--json")["units"] == "relative"
-    refused(1, "export", "--mesh", tmp_path / "now.ply", *ipc, said=("no calibration", "no unit"))
-    bag = tmp_path / "bag"
-    assert figures_of("bag", "record", "-o", bag, *ipc, "--seconds", "3", "--json")["messages"] > 0
+        refused(1, "export", "--mesh", tmp_path / "now.ply", *ipc, said=("no calibration", "no unit"))
+        bag = tmp_path / "bag"
+        assert figures_of("bag", "record", "-o", bag, *ipc, "--seconds", "3", "--json")["messages"] > 0
     assert recorded_rig(load_launch(bag).source) is None  # as ROS says it of cameras that nobody calibrated
 
 

@@ -1,7 +1,8 @@
 """Launch files: every key is known, paths are found, mistakes are explained."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin
 
@@ -10,17 +11,7 @@ from annotated_types import Ge, Gt, Le
 from places import ROOT
 
 from sags_node.config.launch_file import load_launch, with_parameters
-from sags_node.config.schema import (
-    FoldersSource,
-    LaunchConfig,
-    MappingConfig,
-    PushRobot,
-    PushSource,
-    Section,
-    V4l2Source,
-    VideosSource,
-    VisionConfig,
-)
+from sags_node.config.schema import LaunchConfig, MappingConfig, Section, VisionConfig
 from sags_node.errors import UsageError
 
 
@@ -31,79 +22,70 @@ def test_every_launch_file_loads(file: Path) -> None:
         assert (config.rig / "left.yaml").is_file()
 
 
-def test_no_launch_file_means_the_phantom() -> None:
-    assert load_launch().source.kind == "phantom"
+def found_in(config: LaunchConfig, keys: Iterable[str]) -> dict[str, Any]:
+    return {key: attrgetter(key)(config) for key in keys}
 
 
-def test_paths_are_relative_to_the_file_and_variables_are_expanded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        ("source: {kind: folders, left: left, right: $EYES/right}\nrig: calib",
+         {"source.left": Path("sub/left"), "source.right": Path("/eyes/right"), "rig": Path("sub/calib")}),
+        # No shell expands the user's home behind `:=`.
+        ("source: {kind: folders, left: ~/left, right: right}\nrig: ~/calib",
+         {"source.left": Path("/me/left"), "source.right": Path("sub/right"), "rig": Path("/me/calib")}),
+        # Of a section of several kinds those of its kind.
+        ("robot: {kind: push, key: a.key, allow: clients, hand_eye: he.yaml}\n"
+         "publish: {key: node.key, allow: [clients, one.pub]}",
+         {"robot.key": Path("sub/a.key"), "robot.allow": (Path("sub/clients"),),
+          "robot.hand_eye": Path("sub/he.yaml"), "publish.key": Path("sub/node.key"),
+          "publish.allow": (Path("sub/clients"), Path("sub/one.pub"))}),
+        # One that stands in two places: they become relative to the file once.
+        ("source: &n {kind: push, key: a.key, allow: [b]}\nrobot: *n",
+         {"source.key": Path("sub/a.key"), "robot.key": Path("sub/a.key")}),
+        # `right` of a source is a path, of publish it is not; `left` of a live source is no path either.
+        ("source: {kind: v4l2, left: a, right: b}\npublish: {right: auto, run_dir: here}",
+         {"source.left": "a", "publish.right": "auto", "publish.run_dir": Path("sub/here")}),
+    ],
+    ids=["variable", "home", "kinds", "twice", "no path"],
+)  # fmt: skip
+def test_paths_are_relative_to_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: str, found: dict[str, Any]
 ) -> None:
-    monkeypatch.setenv("EYES", "/somewhere")
-    file = tmp_path / "launch.yaml"
-    file.write_text("source: {kind: folders, left: left, right: $EYES/right}\nrig: calib\n")
-    config = load_launch(tmp_path)
-    assert isinstance(config.source, FoldersSource)
-    assert config.source.left == tmp_path / "left"
-    assert config.source.right == Path("/somewhere/right")
-    assert config.rig == tmp_path / "calib"
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("EYES", "/eyes")
+    monkeypatch.setenv("HOME", "/me")
+    Path("sub").mkdir()
+    Path("sub/launch.yaml").write_text(content)
+    assert found_in(load_launch(Path("sub")), found) == found
 
 
-def test_a_path_may_begin_with_the_users_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No shell expands it behind `:=`."""
-    home = tmp_path / "me"
-    monkeypatch.setenv("HOME", str(home))
-    (tmp_path / "mine.yaml").write_text("source: {kind: folders, left: ~/left, right: right}")
-    config = load_launch(tmp_path / "mine.yaml", ["rig:=~/calib"])
-    assert config.source.left == home / "left" and config.source.right == tmp_path / "right"
-    assert config.rig == home / "calib"
-
-
-def test_paths_of_a_section_of_several_kinds_are_those_of_its_kind(tmp_path: Path) -> None:
-    file = tmp_path / "launch.yaml"
-    file.write_text(
-        "robot: {kind: push, key: a.key, allow: clients, hand_eye: he.yaml}\n"
-        "publish: {key: node.key, allow: [clients, one.pub]}"
-    )
-    robot, publish = load_launch(file).robot, load_launch(file).publish
-    assert publish.key == tmp_path / "node.key"
-    assert publish.allow == (tmp_path / "clients", tmp_path / "one.pub")
-    assert isinstance(robot, PushRobot)
-    assert (robot.key, robot.allow) == (tmp_path / "a.key", (tmp_path / "clients",))
-    assert robot.hand_eye == tmp_path / "he.yaml"
-
-
-@pytest.mark.parametrize("name", ["/data/Case #3/left", "#2", "&abc def", "a # b", "left"])
-def test_a_word_of_the_command_line_has_no_comments(name: str) -> None:
-    eyes = "source.kind:=folders", "source.right:=right"
-    for left in (name, f"'{name}'"):
-        config = load_launch(None, [*eyes, f"source.left:={left}"])
-        assert isinstance(config.source, FoldersSource) and str(config.source.left) == name
-    assert load_launch(None, ["rig:=null"]).rig is None
-
-
-def test_a_word_that_is_a_path_elsewhere_is_none(tmp_path: Path) -> None:
-    """`right` of a source is a path, of publish it is not; `left` of a live source is no path either."""
-    file = tmp_path / "launch.yaml"
-    file.write_text("source: {kind: v4l2, left: a, right: b}\npublish: {right: auto, run_dir: here}")
-    found = load_launch(file)
-    assert (found.publish.right, found.publish.run_dir) == ("auto", tmp_path / "here")
-    assert isinstance(found.source, V4l2Source) and found.source.left == "a"
-
-
-def test_a_key_that_a_sender_may_use_is_none_too_many() -> None:
-    """It sends each eye by itself, or both in one image. Where a method is said, others' keys may stay."""
-    source = load_launch(None, ["source:={kind: push, geometry: {first: right}}"]).source
-    assert isinstance(source, PushSource) and source.geometry.first == "right"
-    load_launch(None, ["vision.tissue:={method: classical, path: net.onnx}"])
-
-
-def test_overrides_win_over_the_file() -> None:
-    config = load_launch(
-        ROOT / "launch/d4d_pull.yaml", ["mapping.budget_ms:=50", "source.tools:=[1, 2, 300, 200]"]
-    )
-    assert config.mapping.budget_ms == 50
-    assert isinstance(config.source, VideosSource)
-    assert config.source.tools == (1, 2, 300, 200)
+@pytest.mark.parametrize(
+    ("launch", "overrides", "found"),
+    [
+        (None, [], {"source.kind": "phantom"}),
+        (None, ["rig:=null"], {"rig": None}),
+        (None, ["source:={kind: folders, left: ~/left, right: a}", "rig:=~/calib"],
+         {"source.left": Path("/me/left"), "rig": Path("/me/calib")}),
+        ("d4d_pull.yaml", ["mapping.budget_ms:=50", "source.tools:=[1, 2, 300, 200]"],
+         {"mapping.budget_ms": 50, "source.tools": (1, 2, 300, 200)}),
+        # It sends each eye by itself, or both in one image: no key too many.
+        (None, ["source:={kind: push, geometry: {first: right}}"], {"source.geometry.first": "right"}),
+        # Where a method is said, others' keys may stay.
+        (None, ["vision.tissue:={method: classical, path: net.onnx}"], {"vision.tissue.method": "classical"}),
+        # A word of the command line has no comments.
+        *((None, ["source.kind:=folders", "source.right:=right", f"source.left:={word}"],
+           {"source.left": Path(name)})
+          for name in ("/data/Case #3/left", "#2", "&abc def", "a # b", "left")
+          for word in (name, f"'{name}'")),
+    ],
+)  # fmt: skip
+def test_overrides_win_over_the_file(
+    monkeypatch: pytest.MonkeyPatch, launch: str | None, overrides: list[str], found: dict[str, Any]
+) -> None:
+    monkeypatch.setenv("HOME", "/me")
+    config = load_launch(launch and ROOT / "launch" / launch, overrides)
+    assert found_in(config, found) == found
 
 
 PANES = "{layout: panes, first: right, crop: [0, 0, 8, 8], crop_right: [8, 0, 8, 8]}"
@@ -113,6 +95,7 @@ PANES = "{layout: panes, first: right, crop: [0, 0, 8, 8], crop_right: [8, 0, 8,
     ("override", "said"),
     [
         ("mapping.budgt_ms:=3", "did you mean 'budget_ms'"),
+        ("publish.data:=tcp://127.0.0.1:5", "publish.data: Input should be a list, e.g. [a, b] (got 'tcp:"),
         ("source.secnds:=3", "did you mean 'seconds'"),
         ("vision.stereo.scal:=2", "did you mean 'scale'"),
         ("zzz:=3", "known keys: "),
@@ -211,13 +194,9 @@ def numbers(kind: Any, key: str, limits: tuple[object, ...] = ()) -> Iterator[tu
 def test_every_number_has_a_lower_and_an_upper_limit() -> None:
     every = dict(numbers(LaunchConfig, ""))
     assert {"MappingConfig.budget_ms", "GeometryConfig.crop", "LaunchConfig.segments"} <= set(every)
-    endless = [
-        key
-        for key, limits in every.items()
-        if not any(isinstance(one, Ge | Gt) for one in limits)
-        or not any(isinstance(one, Le) for one in limits)
-    ]
-    assert endless == []
+    for key, limits in every.items():
+        assert any(isinstance(one, Ge | Gt) for one in limits), key
+        assert any(isinstance(one, Le) for one in limits), key
 
 
 @pytest.mark.parametrize("number", [".inf", "-.inf", ".nan", "1.0e300"])

@@ -1,6 +1,7 @@
 """YAML as users, programs and pranksters write it: values, or one short line: what is wrong, and where."""
 
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,13 @@ import yaml
 from places import ROOT
 
 from sags_node.bags.bag import storage_files
+from sags_node.clients.overlay.scene import read_scene
 from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import OnnxConfig
 from sags_node.config.yaml_reader import MOST_VALUES, parse_word, parse_yaml, read_yaml
 from sags_node.errors import UsageError
 from sags_node.rig import load_rig, read_rig
+from sags_node.vision.onnx_session import read_format
 
 LONGEST = 300  # characters of a message, without the name of the file
 
@@ -123,46 +127,23 @@ def as_launch(text: str, folder: Path) -> object:
     return load_launch(folder)
 
 
-def as_override(text: str, folder: Path) -> object:
-    return load_launch(None, [f"source:={text}"])
-
-
-def as_calibration(text: str, folder: Path) -> object:
-    for side in ("left", "right"):
-        (folder / f"{side}.yaml").write_text((ROOT / f"calib/d4d/{side}.yaml").read_text() + text)
-    return load_rig(folder)
-
-
-def as_opencv(text: str, folder: Path) -> object:
-    (folder / "rig.yml").write_text(f"%YAML:1.0\n---\n{text}")
-    return read_rig(folder / "rig.yml")
-
-
-def as_scene(text: str, folder: Path) -> object:
-    from sags_node.clients.overlay.scene import read_scene
-
-    (folder / "scene.yaml").write_text(text)
-    return read_scene(folder / "scene.yaml")
-
-
-def as_bag(text: str, folder: Path) -> object:
-    (folder / "metadata.yaml").write_text(text)
-    return storage_files(folder)
-
-
-def as_network(text: str, folder: Path) -> object:
-    from sags_node.config.schema import OnnxConfig
-    from sags_node.vision.onnx_session import read_format
-
-    (folder / "net.yaml").write_text(text)
+def network_format(folder: Path) -> object:
     return read_format(OnnxConfig(path=folder / "net.onnx"), {})
 
 
-Reader = Callable[[str, Path], object]
-READERS: list[Reader] = [as_launch, as_override, as_calibration, as_opencv, as_scene, as_bag, as_network]
+LEFT = (ROOT / "calib/d4d/left.yaml").read_text()
+READERS: dict[str, tuple[str, str, Callable[[Path], object]]] = {  # file, what stands before, who reads it
+    "launch file": ("launch.yaml", "", load_launch),
+    "calibration": ("left.yaml", LEFT, load_rig),
+    "calibration of OpenCV": ("rig.yml", "%YAML:1.0\n---\n", lambda folder: read_rig(folder / "rig.yml")),
+    "scene": ("scene.yaml", "", lambda folder: read_scene(folder / "scene.yaml")),
+    "bag": ("metadata.yaml", "", storage_files),
+    "network": ("net.yaml", "", network_format),
+    "override": ("none", "", lambda folder: load_launch(None, [f"source:={(folder / 'none').read_text()}"])),
+}
 
 
-@pytest.mark.parametrize("read", READERS)
+@pytest.mark.parametrize("reader", READERS)
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -172,20 +153,11 @@ READERS: list[Reader] = [as_launch, as_override, as_calibration, as_opencv, as_s
     ],
     ids=["twice", "itself", "bomb"],
 )
-def test_every_reader_is_this_one(read: Reader, text: str, said: str, tmp_path: Path) -> None:
-    message = refusal(lambda: read(text, tmp_path))
-    assert said in message.replace(str(tmp_path), "")
-
-
-def test_a_section_of_a_launch_file_may_stand_in_two_places(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its paths become relative to the file once."""
-    monkeypatch.chdir(tmp_path)
-    folder = Path("sub")
-    folder.mkdir()
-    config: Any = as_launch("source: &n {kind: push, key: a.key, allow: [b]}\nrobot: *n\n", folder)
-    assert config.source.key == config.robot.key == folder / "a.key"
+def test_every_reader_is_this_one(reader: str, text: str, said: str, tmp_path: Path) -> None:
+    name, before, read = READERS[reader]
+    (tmp_path / name).write_text(before + text)
+    shutil.copy(ROOT / "calib/d4d/right.yaml", tmp_path)  # the other eye of a rig
+    assert said in refusal(lambda: read(tmp_path)).replace(str(tmp_path), "")
 
 
 def test_a_value_of_any_size_is_shown_in_short(tmp_path: Path) -> None:

@@ -13,13 +13,37 @@ from synthetic import at_frame, plane_result, stream
 from waiting import beside, until
 
 from sags_node.config.schema import PublishConfig
+from sags_node.messaging import topics
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.publisher import Publisher
 from sags_node.types import AnchorStates, FrameResult
 
 T = TypeVar("T")
 
+FRAME_TOPICS = [topic.name for topic in topics.TOPICS if topic.name != "parameters"]
 SEEN, HIDDEN, LOST, UNSURE = 3, 5, 8, 9  # numbers of the anchors in `anchored`
+
+
+class Pinned:
+    """A node's control operations for anchors, and what was asked of them."""
+
+    def __init__(self, first: int = 1) -> None:
+        self._first = first
+        self.added: list[dict[str, Any]] = []
+        self.removed: list[int] = []
+        self.handlers = {"add_anchor": self._add, "remove_anchor": self._remove}
+
+    def _add(self, args: dict[str, Any]) -> dict[str, Any]:
+        self.added.append(args)
+        return {"id": self._first + len(self.added) - 1, "frame_id": 7, "depth_confidence": 0.9}
+
+    def _remove(self, args: dict[str, Any]) -> None:
+        self.removed.append(args["id"])
+
+
+def asked(running: Publisher) -> set[str]:
+    """The topics that clients ask this node for."""
+    return {name for name in FRAME_TOPICS if running.wanted(name)}
 
 
 @contextmanager
@@ -36,31 +60,19 @@ def sockets(
         yield running
 
 
-def senders(run_dir: Path) -> dict[str, Any]:
-    """The options of a bridge that say where `sockets` are, and an overlay."""
-    return {"node": NodeAddress(run_dir=run_dir), "overlay": NodeAddress("overlay", run_dir=run_dir)}
-
-
 def options_of(kind: Callable[..., T], run_dir: Path, **said: Any) -> T:
-    return kind(**{**senders(run_dir), **said})
+    """Those of a bridge to the node of `sockets`, and to an overlay."""
+    node, overlay = NodeAddress(run_dir=run_dir), NodeAddress("overlay", run_dir=run_dir)
+    return kind(**{"node": node, "overlay": overlay, **said})
 
 
-def anchored(result: FrameResult | None = None) -> FrameResult:
+def anchored() -> FrameResult:
     """The plane with four anchors on it: one seen, one hidden, one lost, one seen and not recognised."""
-    result = result or plane_result()
     places = np.array([[0.01, 0.02, 0.07], [-0.01, 0.0, 0.08], [np.nan] * 3, [0.0, 0.01, 0.08]], np.float32)
     pixels = np.array([[20, 20], [50, 30], [np.nan] * 2, [75, 45]], np.float32)
-    ones = np.ones(4, np.float32)
-    states = AnchorStates(
-        np.array([SEEN, HIDDEN, LOST, UNSURE]),
-        places,
-        pixels,
-        np.array([1, 0, 0, 1], np.float32),
-        np.array([1, 1, 1, 0.2], np.float32),
-        ones,
-        ones,
-    )
-    return replace(result, anchors=states)
+    seen, sure = np.array([1, 0, 0, 1], np.float32), np.array([1, 1, 1, 0.2], np.float32)
+    numbers, ones = np.array([SEEN, HIDDEN, LOST, UNSURE]), np.ones(4, np.float32)
+    return replace(plane_result(), anchors=AnchorStates(numbers, places, pixels, seen, sure, ones, ones))
 
 
 def anchored_at(number: int) -> FrameResult:

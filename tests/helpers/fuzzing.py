@@ -11,7 +11,7 @@ import shutil
 import signal
 import struct
 import tarfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -63,6 +63,7 @@ from sags_node.sources.numbered import open_numbered
 from sags_node.sources.pose_track import PoseTrack
 from sags_node.sources.source import open_source
 from sags_node.sources.truth import load_array, load_npy
+from sags_node.tools.export.surface_files import Surface, encoded
 from sags_node.vision.onnx_depth import DepthNetwork
 from sags_node.vision.tissue_topic import TopicMasks
 
@@ -179,6 +180,7 @@ def bounded_memory(most: int = MOST_MEMORY) -> Iterator[None]:
 
 def requests(_: Path) -> list[bytes]:
     rng = np.random.default_rng(0)
+    view = {"name": "top", "width": 64, "height": 48}
     good: list[tuple[str, dict[str, Any]]] = [
         ("echo", {"a": [1, {"b": None}]}),
         ("add_anchor", {"u": 3, "v": 4.5, "ahead_ms": "auto"}),
@@ -186,11 +188,8 @@ def requests(_: Path) -> list[bytes]:
         ("remove_anchor", {"id": 5}),
         ("measure", {"anchors": [1, 2], "area": False}),
         ("close_view", {"name": "top"}),
-        (
-            "open_view",
-            {"name": "top", "width": 64, "height": 48, "fov": 60.0, "T_world_cam": np.eye(4).tolist()},
-        ),
-        ("open_view", {"name": "top", "width": 64, "height": 48, "K": np.diag((50, 50, 1)).tolist()}),
+        ("open_view", {**view, "fov": 60.0, "T_world_cam": np.eye(4).tolist()}),
+        ("open_view", {**view, "K": np.diag((50, 50, 1)).tolist()}),
     ]
     packed = [msgpack.packb({"v": "1.0", "id": 7, "op": op, "args": args}) for op, args in good]
     return packed + [hostile.random_request(rng) for _ in range(200)]
@@ -219,45 +218,33 @@ def answer(data: bytes, _: Path) -> None:
 # ---- messages ------------------------------------------------------------------------------------------
 
 
-def messages(_: Path) -> list[bytes]:
+def messages(*names: str) -> list[bytes]:
+    """These topics of a frame, or all."""
     result = plane_result(stamp_ns=1_000_000)
-    made = {
-        name: make(result) for name, make in content.FRAME_CONTENT.items() if content.tells_of(result, name)
-    }
-    return [joined(name, body) for name, body in made.items()]
+    told = [name for name in names or content.FRAME_CONTENT if content.tells_of(result, name)]
+    made = [message_of(name, content.FRAME_CONTENT[name](result), stamp_ms=1) for name in told]
+    return [PARTS.join(bytes(part) for part in encode(one)) for one in made]
 
 
-def joined(name: str, body: cdr.Content) -> bytes:
-    return PARTS.join(bytes(part) for part in encode(message_of(name, body, stamp_ms=1)))
-
-
-def read_message(data: bytes, _: Path) -> None:
+def read_message(data: bytes, _: Path) -> ReceivedImage | None:
     got = interpret(decode(data.split(PARTS)), 0)
-    if isinstance(got, ReceivedImage):
-        assert got.array.nbytes <= len(data)
+    if not isinstance(got, ReceivedImage):
+        return None
+    assert got.array.nbytes <= len(data)
+    return got
 
 
-def masks(_: Path) -> list[bytes]:
-    made = content.FRAME_CONTENT["left/tissue_mask"](plane_result(stamp_ns=1_000_000))
-    return [joined("left/tissue_mask", made)]
-
-
-def use_mask(data: bytes, _: Path) -> None:
-    got = interpret(decode(data.split(PARTS)), 0)
-    if isinstance(got, ReceivedImage):
+def use_mask(data: bytes, folder: Path) -> None:
+    got = read_message(data, folder)
+    if got is not None:
         pair = plane_result(stamp_ns=1_000_000).pair
         tissue = TopicMasks(cfg.TissueConfig(), lambda _: (got.stamp_ns, got.array))(pair)
         assert tissue.shape == pair.left.shape[:2] and tissue.dtype == bool
 
 
 def thin_files(_: Path) -> list[bytes]:
-    names = (
-        "left/depth/png",
-        "left/image_rect_color/jpeg",
-        "left/tissue_mask/png",
-        "left/render/image/alpha",
-    )
-    asked = {name: topics.thin_picture(f"thin/half/{name}") for name in names}
+    names = ("depth/png", "image_rect_color/jpeg", "tissue_mask/png", "render/image/alpha")
+    asked = {name: topics.thin_picture(f"thin/half/left/{name}") for name in names}
     return [bytes(made.parts[1]) for made in thin.thin_pictures(plane_result(), asked).values()]
 
 
@@ -343,12 +330,14 @@ def read_dvrk(data: bytes, folder: Path) -> None:
     read_sidecar(folder / "stereo.json")
 
 
-def numbered_archives(_: Path) -> list[bytes]:
+def archive_of(names: Iterable[str], content: Callable[[str], bytes]) -> bytes:
     raw = io.BytesIO()
     with tarfile.open(fileobj=raw, mode="w") as archive:
-        for number in (0, 2, 1):
-            archive.addfile(tarfile.TarInfo(f"./frame{number:06d}.json"))
-    return [raw.getvalue()]
+        for name in names:
+            member = tarfile.TarInfo(name)
+            member.size = len(content(name))
+            archive.addfile(member, io.BytesIO(content(name)))
+    return raw.getvalue()
 
 
 def read_numbered(data: bytes, folder: Path) -> None:
@@ -377,14 +366,6 @@ def read_ros_rig(data: bytes, folder: Path) -> None:
     check_rig(read_rig(folder))
 
 
-def archives(_: Path) -> list[bytes]:
-    raw = io.BytesIO()
-    with tarfile.open(fileobj=raw, mode="w") as archive:
-        for file in RIG:
-            archive.add(file, file.name)
-    return [raw.getvalue()]
-
-
 def read_archive(data: bytes, folder: Path) -> None:
     (folder / "calibrationdata.tar.gz").write_bytes(gzip.compress(data, 1))
     check_rig(read_rig(folder))
@@ -409,46 +390,28 @@ def read_opencv_rig(data: bytes, folder: Path) -> None:
     check_rig(read_rig(file, (640, 512)))
 
 
-CORNERS = np.array([[0, 0, 0], [0.01, 0, 0], [0.01, 0.01, 0], [0, 0.01, 0]], "<f4")
-FACES = [(0, 1, 2), (0, 1, 3), (0, 1, 2, 3)]
-PLACES = "".join(f"{x:g} {y:g} {z:g}\n" for x, y, z in CORNERS)
+CORNERS = "0 0 0\n0.01 0 0\n0.01 0.01 0\n0 0.01 0\n"
+MESHES = {  # a square, as text
+    "ply": "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    f"{CORNERS}3 0 1 2\n4 0 1 2 3\n",
+    "obj": f"v {CORNERS.strip()}\n".replace("\n0", "\nv 0") + "f 1 2 3 4\nf 1/1/1 2//2 -1\n",
+    "stl": "solid a\nfacet normal 0 0 1\nouter loop\n"
+    "vertex 0 0 0\nvertex 0.01 0 0\nvertex 0.01 0.01 0\nendloop\nendfacet\nendsolid a\n",
+    "pcd": "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 4\nHEIGHT 1\n"
+    f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 4\nDATA ascii\n{CORNERS}",
+    "xyz": CORNERS,
+}
 
 
-def ply_files(_: Path) -> list[bytes]:
-    head = "element vertex 4\n" + "".join(f"property float {a}\n" for a in "xyz") + "element face 3\n"
-    head += "property list uchar int vertex_indices\nend_header\n"
-    lines = "".join(f"{len(face)} {' '.join(map(str, face))}\n" for face in FACES)
-    binary = b"ply\nformat binary_little_endian 1.0\n" + head.encode() + CORNERS.tobytes()
-    binary += b"".join(struct.pack(f"<B{len(face)}i", len(face), *face) for face in FACES)
-    return [f"ply\nformat ascii 1.0\n{head}{PLACES}{lines}".encode(), binary]
+def mesh_files(kind: str) -> Target:
+    def sound(_: Path) -> list[bytes]:
+        points, triangles = np.eye(4, 3, dtype=np.float32), np.array([(0, 1, 2), (0, 1, 3)], np.int32)
+        square = Surface(points, np.zeros((4, 3), np.uint8), points, triangles)
+        return [MESHES[kind].encode(), *([] if kind == "xyz" else [encoded(f".{kind}", square)])]
 
-
-def obj_files(_: Path) -> list[bytes]:
-    places = "".join(f"v {line}\n" for line in PLACES.splitlines())
-    faces = "".join(f"f {' '.join(str(corner + 1) for corner in face)}\n" for face in FACES)
-    return [(places + faces).encode(), (places + "f 1/1/1 2//2 -1\n").encode()]
-
-
-def stl_files(_: Path) -> list[bytes]:
-    text = "solid a\n"
-    binary = bytes(80) + struct.pack("<I", 2)
-    for face in FACES[:2]:
-        corners = CORNERS[list(face)]
-        text += "facet normal 0 0 1\nouter loop\n"
-        text += "".join(f"vertex {x:g} {y:g} {z:g}\n" for x, y, z in corners) + "endloop\nendfacet\n"
-        binary += bytes(12) + corners.tobytes() + bytes(2)
-    return [f"{text}endsolid a\n".encode(), binary]
-
-
-def pcd_files(_: Path) -> list[bytes]:
-    head = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 4\nHEIGHT 1\n"
-    head += "VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 4\nDATA "
-    return [f"{head}ascii\n{PLACES}".encode(), f"{head}binary\n".encode() + CORNERS.tobytes()]
-
-
-def mesh_files(sound: Callable[[Path], Sequence[bytes]], suffix: str) -> Target:
     def use(data: bytes, folder: Path) -> None:
-        file = folder / f"mesh{suffix}"
+        file = folder / f"mesh.{kind}"
         file.write_bytes(data)
         mesh = mesh_of(ObjectSpec(file=file))
         assert mesh is not None and np.isfinite(mesh.vertices).all()
@@ -493,26 +456,28 @@ def read_film(data: bytes, folder: Path) -> None:
 
 TARGETS: dict[str, Target] = {
     "requests": Target(requests, answer),
-    "messages": Target(messages, read_message),
-    "masks": Target(masks, use_mask),
+    "messages": Target(lambda _: messages(), read_message),
+    "masks": Target(lambda _: messages("left/tissue_mask"), use_mask),
     "thin images": Target(thin_files, lambda data, _: thin.decode("sags/thin", 0.01, data)),
     "poses": Target(poses, read_pose),
     "pictures": Target(pictures, read_picture),
     **{kind: bag(kind) for kind in BAGS},
     "arrays": Target(arrays, read_arrays),
     "sidecars": Target(sidecars, read_dvrk),
-    "numbered archive": Target(numbered_archives, read_numbered),
+    "numbered archive": Target(
+        lambda _: [archive_of([f"./frame{number:06d}.json" for number in (0, 2, 1)], lambda _: b"")],
+        read_numbered,
+    ),
     "launch files": Target(
         lambda _: [f.read_bytes() for f in sorted((ROOT / "launch").glob("*.yaml"))], read_launch
     ),
     "ros calibration": Target(lambda _: [file.read_bytes() for file in RIG], read_ros_rig),
-    "calibration archive": Target(archives, read_archive),
+    "calibration archive": Target(
+        lambda _: [archive_of([file.name for file in RIG], lambda name: (RIG[0].parent / name).read_bytes())],
+        read_archive,
+    ),
     "opencv calibration": Target(opencv_rigs, read_opencv_rig),
-    "ply": mesh_files(ply_files, ".ply"),
-    "obj": mesh_files(obj_files, ".obj"),
-    "stl": mesh_files(stl_files, ".stl"),
-    "pcd": mesh_files(pcd_files, ".pcd"),
-    "xyz": mesh_files(lambda _: [PLACES.encode()], ".xyz"),
+    **{kind: mesh_files(kind) for kind in MESHES},
     "networks": Target(networks, open_network),
     "videos": Target(films, read_film),
 }

@@ -1,5 +1,6 @@
 """What users have lying about: recordings and calibrations, most of them wrong in one way."""
 
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -61,3 +62,12 @@ def videos(folder: Path, left: str = "left.mp4", right: str = "right.mp4", rig: 
         "source.kind:=videos", f"source.left:={folder / left}", f"source.right:={folder / right}",
         f"rig:={folder / rig}", *RUN_HERE,
     ]  # fmt: skip
+
+
+def words_of(command: str, folder: Path) -> list[str]:
+    """Of a command as one types it. FILES is that folder, VIDEOS what plays its two videos, but for keys that
+    the command gives itself."""
+    words = [word.replace("FILES", str(folder)) for word in shlex.split(command)]
+    given = {word.partition(":=")[0] for word in words}
+    played = [word for word in videos(folder) if word.partition(":=")[0] not in given]
+    return [each for word in words for each in (played if word == "VIDEOS" else [word])]
