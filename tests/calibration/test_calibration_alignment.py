@@ -25,10 +25,11 @@ from sags_node.vision.rectify import Rectifier
 
 SIZE = 640, 512
 DISPARITIES = 8.0, 60.0  # px at the matching size
+Turn = tuple[float, float, float]
 Field = tuple[F32, Bool, int]  # row errors, where they are known, and the width of the image they are of
 
 
-def rectified(session: Path, degrees: tuple[float, float, float]) -> tuple[U8, U8]:
+def rectified(session: Path, degrees: Turn) -> tuple[U8, U8]:
     """A pair of the phantom, rectified as if its right eye stood as calibrated; it is turned."""
     rig = load_rig(session / "calib")
     turn = cv2.Rodrigues(np.radians(degrees))[0]
@@ -39,7 +40,7 @@ def rectified(session: Path, degrees: tuple[float, float, float]) -> tuple[U8, U
     return pair.left, pair.right
 
 
-def field(session: Path, degrees: tuple[float, float, float]) -> Field:
+def field(session: Path, degrees: Turn) -> Field:
     patches = match_patches(*map(gray_pyramid, rectified(session, degrees)), DISPARITIES, 1)
     return patches.field[..., 1], patches.good, SIZE[0] // 2
 
@@ -51,33 +52,30 @@ def monitor_after(fields: Field, count: int = FEWEST_FIELDS) -> RowMonitor:
     return monitor
 
 
-def test_a_rig_that_fits(phantom_session: Path) -> None:
-    alignment = monitor_after(field(phantom_session, (0, 0, 0))).alignment
-    assert alignment is not None and alignment.warning == ""
-    assert abs(alignment.median) < 0.2 and alignment.spread < 0.8
-
-
-@pytest.mark.parametrize("degrees", [0.3, -0.3])
-def test_an_eye_that_looks_up_or_down(phantom_session: Path, degrees: float) -> None:
-    alignment = monitor_after(field(phantom_session, (degrees, 0, 0))).alignment
-    assert alignment is not None and "rows of the eyes differ" in alignment.warning
+@pytest.mark.parametrize(
+    ("degrees", "median", "tolerance", "spread"),  # px
+    [
+        pytest.param((0, 0, 0), 0, 0.2, (0, 0.8), id="as calibrated"),
+        pytest.param((0.3, 0, 0), 0.3, 0.3, (0, 1), id="looks down"),
+        pytest.param((-0.3, 0, 0), 0.3, 0.3, (0, 1), id="looks up"),
+        pytest.param((0, 0, 0.3), 0, 0.8, (2, 99), id="turned about its axis: only the spread tells"),
+    ],
+)
+def test_an_eye_that_is_turned(
+    phantom_session: Path, degrees: Turn, median: float, tolerance: float, spread: tuple[float, float]
+) -> None:
+    alignment = monitor_after(field(phantom_session, degrees)).alignment
+    assert alignment is not None and ("rows of the eyes differ" in alignment.warning) == any(degrees)
     focal = load_rig(phantom_session / "calib").left.P[0, 0] * 2
-    assert abs(alignment.median) == pytest.approx(focal * np.radians(0.3), abs=0.3)
-    assert alignment.spread < 1
-
-
-def test_an_eye_turned_about_its_axis(phantom_session: Path) -> None:
-    """The median stays, only the spread tells."""
-    alignment = monitor_after(field(phantom_session, (0, 0, 0.3))).alignment
-    assert alignment is not None and alignment.warning
-    assert abs(alignment.median) < 0.8 and alignment.spread > 2
+    assert abs(alignment.median) == pytest.approx(focal * np.radians(median), abs=tolerance)
+    assert spread[0] <= alignment.spread < spread[1]
 
 
 @pytest.mark.parametrize("degrees", [0.6, 1.0])
 def test_an_eye_turned_beyond_what_can_be_matched(phantom_session: Path, degrees: float) -> None:
-    row_error, known, width = field(phantom_session, (degrees, 0, 0))
-    assert known.mean() < 0.2  # the scene is what the test is for
-    alignment = monitor_after((row_error, known, width)).alignment
+    turned = field(phantom_session, (degrees, 0, 0))
+    assert turned[1].mean() < 0.2  # the scene is what the test is for
+    alignment = monitor_after(turned).alignment
     assert alignment is not None and alignment.warning
 
 

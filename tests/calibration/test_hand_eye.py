@@ -15,16 +15,16 @@ from places import ROOT
 from sags_node.config.launch_file import load_launch
 from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer
 from sags_node.errors import SagsError, UsageError
-from sags_node.geometry import invert, matrix_to_quat
+from sags_node.geometry import invert
 from sags_node.messaging import cdr, topics
 from sags_node.phantom.board import draw, fine_rays
 from sags_node.phantom.motion import scope_pose
 from sags_node.phantom.rig import phantom_rig
-from sags_node.pipeline.session import open_session
+from sags_node.pipeline.session import Session, open_session
 from sags_node.rig import save_rig
 from sags_node.rig.hand_eye import HandEye, read_hand_eye, save_hand_eye
 from sags_node.sources.pose_track import PoseTrack
-from sags_node.sources.robot import open_robot, rectified
+from sags_node.sources.robot import open_robot
 from sags_node.sources.source import open_source
 from sags_node.tools.calibration.boards import StereoView
 from sags_node.tools.calibration.hand_eye_solve import solve_hand_eye
@@ -32,7 +32,7 @@ from sags_node.tools.calibration.pictures import spread
 from sags_node.tools.evaluation.measure import MeasureOptions
 from sags_node.tools.evaluation.session import evaluate
 from sags_node.tools.fitting.clip import read_clip
-from sags_node.types import F32, F64, Bool, Camera, Gaussians, StereoRig
+from sags_node.types import F32, F64, Bool, Camera, Gaussians
 
 S, MS = 1_000_000_000, 1_000_000
 START = 1_700_000_000 * S
@@ -94,21 +94,19 @@ def grid() -> F32:
     return (np.stack([x - 4, y - 2.5, 0 * x], -1).reshape(-1, 3) * 0.0045).astype(np.float32)
 
 
-def seen(
-    rig: StereoRig, seconds: float, rate: float, noise: float, scale: float
-) -> tuple[list[StereoView], list[int]]:
-    """The corners of a board 70 mm before the scope, with a detector's noise (px)."""
+def seen(scale: float) -> tuple[list[StereoView], list[int]]:
+    """The corners of a board 70 mm before the scope, ten times a second, with noise of 0.1 px."""
     rng = np.random.default_rng(8)
     board = camera_at(0) @ rigid((12, -8, 3), (0, 0, 0.07))
     views, stamps = [], []
-    for number in range(round(seconds * rate)):
-        left = invert(camera_at(number / rate, scale)) @ board
+    for number in range(round(PERIOD * 10)):
+        left = invert(camera_at(number / 10, scale)) @ board
         corners = []
-        for eye, T in ((rig.left, left), (rig.right, rig.T_right_left @ left)):
+        for eye, T in ((RIG.left, left), (RIG.right, RIG.T_right_left @ left)):
             drawn, _ = cv2.projectPoints(grid(), T[:3, :3], T[:3, 3], eye.K, eye.distortion)
-            corners.append((drawn.reshape(-1, 2) + rng.normal(0, noise, (54, 2))).astype(np.float32))
+            corners.append((drawn.reshape(-1, 2) + rng.normal(0, 0.1, (54, 2))).astype(np.float32))
         views.append(StereoView(str(number), np.arange(54), *corners))
-        stamps.append(START + round(number / rate * S))
+        stamps.append(START + round(number / 10 * S))
     return views, stamps
 
 
@@ -123,7 +121,7 @@ def errors(found: F64) -> tuple[float, float]:
 def test_it_is_found_on_the_phantoms_path(scale: float, offset_ms: float) -> None:
     """Also from its own sway of 1.7 degrees alone, with the corners' usual noise of 0.1 px."""
     track = tracked(offset_ms, PERIOD, scale)
-    views, stamps = seen(RIG, PERIOD, 10, 0.1, scale)
+    views, stamps = seen(scale)
     solution = solve_hand_eye(views, stamps, grid(), RIG, track.at)
     place, turn = errors(solution.hand_eye.T_hand_cam)
     assert place < 0.3 and turn < 0.2
@@ -139,26 +137,11 @@ def test_a_robot_that_is_not_exact_costs_no_more_than_its_own_error(noise: float
     """Its error moves all corners of a view alike. Of 40 views that turn by 0.12 rad, root mean square, the
     turn follows to noise / 0.12 / sqrt(40) about each axis, to 2.3 times the noise in all: twice that holds.
     """
-    views, stamps = seen(RIG, PERIOD, 10, 0.1, 6.0)
+    views, stamps = seen(6.0)
     solution = solve_hand_eye(views, stamps, grid(), RIG, tracked(0, PERIOD, 6.0, noise=noise).at)
     place, turn = errors(solution.hand_eye.T_hand_cam)
     assert turn < 4.6 * noise
     assert turn < 4 * np.degrees(solution.rotation_error) and place < 4e3 * solution.position_error
-
-
-def test_a_motion_that_tells_nothing_is_said() -> None:
-    track = tracked(0, PERIOD, 0.0)  # the scope shifts and is never turned
-    views, stamps = seen(RIG, PERIOD, 10, 0.1, 0.0)
-    with pytest.raises(SagsError, match="turn the scope about two different axes"):
-        solve_hand_eye(views, stamps, grid(), RIG, track.at)
-
-
-@pytest.mark.parametrize("unit", [1.05, 0.97])
-def test_lengths_that_are_not_the_robots_are_said(unit: float) -> None:
-    """A board that was printed to fit the page: the stereo calibration is wrong by as much."""
-    views, stamps = seen(RIG, PERIOD, 10, 0.1, 6.0)
-    with pytest.raises(SagsError, match=f"moved {1 / unit:.3f} times as far as the robot says"):
-        solve_hand_eye(views, stamps, grid(), RIG, tracked(0, PERIOD, 6.0, unit=unit).at)
 
 
 def test_a_scope_that_turns_about_one_point_is_calibrated(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,32 +153,34 @@ def test_a_scope_that_turns_about_one_point_is_calibrated(monkeypatch: pytest.Mo
         return turn @ rigid((0, 0, 0), (0, 0, 0.1)) @ X
 
     monkeypatch.setitem(globals(), "camera_at", pivoted)
-    views, stamps = seen(RIG, PERIOD, 10, 0.1, 1.0)
+    views, stamps = seen(1.0)
     place, _ = errors(solve_hand_eye(views, stamps, grid(), RIG, tracked(0, PERIOD).at).hand_eye.T_hand_cam)
     assert place < 0.3
 
 
-def test_poses_of_another_time_are_said() -> None:
-    views, stamps = seen(RIG, PERIOD, 10, 0.1, 1.0)
-    late = [stamp + 60 * S for stamp in stamps]
-    said = "0 of 40 views of the board have a pose of the robot; 20 are needed.* has stopped"
-    with pytest.raises(SagsError, match=said):
-        solve_hand_eye(views, late, grid(), RIG, tracked(0, PERIOD).at)
-    with pytest.raises(SagsError, match=r"9 of 9 views .* 10 are needed.* give a larger --views"):
-        solve_hand_eye(views[:9], stamps[:9], grid(), RIG, tracked(0, PERIOD).at)
-    short = tracked(0, 0.5)  # 1.5 s of poses, ten images a second
-    with pytest.raises(SagsError, match=r"15 of 40 views .* 20 are needed"):
-        solve_hand_eye(views, stamps, grid(), RIG, short.at)
+NO_POSE = r"0 of 40 views .* Frame 2\d: the robot's .*"
 
 
 @pytest.mark.parametrize(
-    ("rate", "unit", "said"), [(100, 1e3, "are its lengths in metres"), (5, 1.0, "poses are 0.20 s apart")]
+    ("scale", "views", "late", "robot", "said"),
+    [
+        pytest.param(0.0, 40, 0, {}, "turn the scope about two different axes", id="it only shifts"),
+        # A board that was printed to fit the page: the stereo calibration is wrong by as much.
+        pytest.param(6.0, 40, 0, {"unit": 1.05}, "moved 0.952 times as far as the robot", id="large print"),
+        pytest.param(6.0, 40, 0, {"unit": 0.97}, "moved 1.031 times as far as the robot", id="small print"),
+        pytest.param(1.0, 40, 60, {}, "0 of 40 views .*; 20 are needed.* has stopped", id="of another time"),
+        pytest.param(1.0, 9, 0, {}, r"9 of 9 views .* 10 are needed.* larger --views", id="few views"),
+        # 1.5 s of poses, ten images a second
+        pytest.param(1.0, 40, 0, {"seconds": 0.5}, r"15 of 40 views .* 20 are needed", id="few poses"),
+        pytest.param(1.0, 40, 0, {"unit": 1e3}, NO_POSE + "are its lengths in metres", id="jumps, of mm"),
+        pytest.param(1.0, 40, 0, {"rate": 5}, NO_POSE + "poses are 0.20 s apart", id="five poses a second"),
+    ],
 )
-def test_why_no_view_has_a_pose_is_said(rate: int, unit: float, said: str) -> None:
-    """Poses in millimetres, which jump, and too few of them."""
-    views, stamps = seen(RIG, PERIOD, 10, 0.1, 1.0)
-    with pytest.raises(SagsError, match=rf"0 of 40 views .* Frame 2\d: the robot's .*{said}"):
-        solve_hand_eye(views, stamps, grid(), RIG, tracked(3, PERIOD, rate=rate, unit=unit).at)
+def test_why_it_cannot_be_found_is_said(scale: float, views: int, late: int, robot: Any, said: str) -> None:
+    track = tracked(**({"offset_ms": 3, "seconds": PERIOD, "scale": scale} | robot))
+    shown, stamps = seen(scale)
+    with pytest.raises(SagsError, match=said):
+        solve_hand_eye(shown[:views], [stamp + late * S for stamp in stamps[:views]], grid(), RIG, track.at)
 
 
 # ---- the file --------------------------------------------------------------------------------------------
@@ -207,6 +192,9 @@ def test_the_file_says_what_was_saved(tmp_path: Path) -> None:
     assert np.allclose(read.T_hand_cam, X, atol=1e-12) and read.offset_ns == -12_345_678
 
 
+SAME = f"T_hand_cam: {np.eye(4).tolist()}"
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [
@@ -215,13 +203,10 @@ def test_the_file_says_what_was_saved(tmp_path: Path) -> None:
         ("T_hand_cam: [[1, 0], [0, 1]]", "no rotation"),
         (f"T_hand_cam: {(2 * np.eye(4)).tolist()}", "no rotation"),
         (f"T_hand_cam: {rigid((0, 0, 0), (0, 0, 220)).tolist()}", "220 m from the hand"),
-        (f"T_hand_cam: {np.eye(4).tolist()}\noffset_ms: .inf", "offset_ms a number"),
-        (f"T_hand_cam: {np.eye(4).tolist()}\noffset_ms: yes", "offset_ms a number"),
-        (f"T_hand_cam: {np.eye(4).tolist()}".replace("1.0", "true"), "4 rows of 4 numbers"),
-        (
-            f"T_hand_cam: {np.eye(4).tolist()}\noffset_s: 0.04",
-            "unknown key 'offset_s'; known: T_hand_cam, offset_ms",
-        ),
+        (f"{SAME}\noffset_ms: .inf", "offset_ms a number"),
+        (f"{SAME}\noffset_ms: yes", "offset_ms a number"),
+        (SAME.replace("1.0", "true"), "4 rows of 4 numbers"),
+        (f"{SAME}\noffset_s: 0.04", "unknown key 'offset_s'; known: T_hand_cam, offset_ms"),
     ],
 )
 def test_a_missing_or_wrong_file_is_said(tmp_path: Path, content: str | None, said: str) -> None:
@@ -235,7 +220,9 @@ def test_a_missing_or_wrong_file_is_said(tmp_path: Path, content: str | None, sa
 # ---- a recording -----------------------------------------------------------------------------------------
 
 VIEWS, RATE = 24, 10
-BOARD = ("--board", "charuco", "--squares", "10x7", "--square-mm", "4.5", "--marker-mm", "3.375")
+ROBOT = ["robot.kind:=bag", "robot.topic:=/ECM/measured_cp"]
+CHESS = "--squares 10x7 --square-mm 4.5".split()
+BOARD = [*CHESS, *"--board charuco --marker-mm 3.375 --dictionary 4X4_50".split()]
 
 
 @pytest.fixture(scope="module")
@@ -262,61 +249,51 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_rosbag2(folder / "bag", rows)
 
 
-def header_of(stamp: int, frame: str) -> Any:
-    types = ROS2.types
-    return types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](*divmod(stamp, S)), frame)
-
-
-def parts_of(T: F64) -> tuple[list[float], Any]:
-    w, x, y, z = (float(q) for q in matrix_to_quat(T[:3, :3]))
-    return [float(t) for t in T[:3, 3]], ROS2.types["geometry_msgs/msg/Quaternion"](x, y, z, w)
-
-
 def pose_message(T: F64, stamp: int) -> Any:
-    place, turn = parts_of(T)
-    pose = ROS2.types["geometry_msgs/msg/Pose"](ROS2.types["geometry_msgs/msg/Point"](*place), turn)
-    return ROS2.types[cdr.POSE](header_of(stamp, "base"), pose)
+    return ROS2.deserialize_cdr(bytes(cdr.pose(T, stamp).parts[0]), cdr.POSE)
 
 
 def transform_message(parent: str, child: str, T: F64, stamp: int) -> Any:
-    place, turn = parts_of(T)
-    moved = ROS2.types["geometry_msgs/msg/Transform"](ROS2.types["geometry_msgs/msg/Vector3"](*place), turn)
-    one = ROS2.types["geometry_msgs/msg/TransformStamped"](header_of(stamp, parent), child, moved)
-    return ROS2.types[topics.TF]([one])
+    types, told = ROS2.types, pose_message(T, stamp)
+    place, turn = told.pose.position, told.pose.orientation
+    moved = types["geometry_msgs/msg/Transform"](
+        types["geometry_msgs/msg/Vector3"](place.x, place.y, place.z), turn
+    )
+    head = types["std_msgs/msg/Header"](told.header.stamp, parent)
+    return types[topics.TF]([types["geometry_msgs/msg/TransformStamped"](head, child, moved)])
+
+
+def exact_pose(number: int, session: Session) -> F64:
+    """Of the rectified camera in that frame of the recording."""
+    exact = camera_at(number / RATE, 5.0)
+    exact[:3, :3] = exact[:3, :3] @ session.rig.left.R.T
+    return exact
 
 
 def test_from_a_bag_to_poses_of_the_camera(recording: Path) -> None:
     """`sags calib hand-eye` writes what makes each frame's pose right, from `measured_cp` and from `tf`."""
     rig = recording.parent / "rig"
-    command = [
-        "calib", "hand-eye", str(recording), f"rig:={rig}", "robot.kind:=bag",
-        "robot.topic:=/ECM/measured_cp", *BOARD, "--dictionary", "4X4_50", "-o", str(rig), "--json",
-    ]  # fmt: skip
-    summary = figures_of(*command)
+    summary = figures_of("calib", "hand-eye", recording, f"rig:={rig}", *ROBOT, *BOARD, "-o", rig, "--json")
     assert summary["views"] >= VIEWS - 2 and summary["error_px"] < 0.3
     hand_eye = read_hand_eye(rig / "hand_eye.yaml")
     place, turn = errors(hand_eye.T_hand_cam)
     assert place < 0.3 and turn < 0.2
     assert hand_eye.offset_ns * 1e-6 == pytest.approx(60, abs=5)
 
-    for robot in (["robot.topic:=/ECM/measured_cp"], ["robot.base:=base", "robot.hand:=tip"]):
-        played = [f"rig:={rig}", "robot.kind:=bag", *robot, "source.pace:=step", "source.rate:=5"]
-        session = open_session(recording, played)
+    for robot in (ROBOT, ["robot.kind:=bag", "robot.base:=base", "robot.hand:=tip"]):
+        session = open_session(recording, [f"rig:={rig}", *robot, "source.pace:=step", "source.rate:=5"])
         with session.source as source:
             frames = list(source)
         assert len(frames) == VIEWS
         for number, frame in enumerate(frames):
             assert frame.pose_problem is None and frame.T_world_cam is not None
-            exact = camera_at(number / RATE, 5.0)
-            exact[:3, :3] = exact[:3, :3] @ session.rig.left.R.T
+            exact = exact_pose(number, session)
             assert np.linalg.norm(frame.T_world_cam[:3, 3] - exact[:3, 3]) < 0.3e-3
             assert np.abs(frame.T_world_cam[:3, :3] - exact[:3, :3]).max() < np.radians(0.2)
 
 
 @pytest.mark.parametrize(("start", "frames"), [(0.0, 13), (0.5, 13), (0.7, None), (1.1, 13)])
-def test_views_are_spread_over_what_is_played_and_nothing_else(
-    recording: Path, start: float, frames: int | None
-) -> None:
+def test_views_are_spread_over_what_is_played(recording: Path, start: float, frames: int | None) -> None:
     """Before and after it the board may have been moved."""
     config = load_launch(recording, [f"source.start:={start}", f"source.frames:={frames or 'null'}"])
     whole = range(VIEWS)[round(start * RATE) :][:frames]
@@ -330,16 +307,12 @@ def test_views_are_spread_over_what_is_played_and_nothing_else(
 
 def test_the_example_gives_what_it_says(tmp_path: Path) -> None:
     """examples/record_board.py, and the command that its first lines name."""
-    folder = tmp_path / "board"
     example = runpy.run_path(str(ROOT / "examples/record_board.py"))
-    example["record"](folder, seconds=2.0)
-    command = [
-        "calib", "hand-eye", str(folder / "bag"), f"rig:={folder / 'rig'}", "robot.kind:=bag",
-        "robot.topic:=/ECM/measured_cp", "--squares", "10x7", "--square-mm", "4.5", "-o", str(folder / "rig"),
-    ]  # fmt: skip
-    code, stdout, stderr = ran(*command)
+    example["record"](tmp_path / "board", seconds=2.0)
+    bag, rig = tmp_path / "board/bag", tmp_path / "board/rig"
+    code, stdout, stderr = ran("calib", "hand-eye", bag, f"rig:={rig}", *ROBOT, *CHESS, "-o", rig)
     assert code == 0, stdout + stderr
-    found = read_hand_eye(folder / "rig/hand_eye.yaml")
+    found = read_hand_eye(rig / "hand_eye.yaml")
     assert np.linalg.norm(found.T_hand_cam[:3, 3] - example["T_HAND_CAMERA"][:3, 3]) < 0.3e-3
     assert found.offset_ns * 1e-9 == pytest.approx(example["AHEAD_S"], abs=0.005)
 
@@ -349,9 +322,9 @@ def test_fits_and_figures_know_where_the_robot_says_the_scope_is(
 ) -> None:
     save_hand_eye(HandEye(X, 60 * MS), tmp_path, {})
     played = [
-        f"rig:={recording.parent / 'rig'}", "robot.kind:=bag", "robot.topic:=/ECM/measured_cp",
-        f"robot.hand_eye:={tmp_path / 'hand_eye.yaml'}", "source.pace:=step", "source.rate:=5",
-        "vision.width:=160", "vision.height:=120", "mapping.max_gaussians:=2000",
+        f"rig:={recording.parent / 'rig'}", *ROBOT, f"robot.hand_eye:={tmp_path / 'hand_eye.yaml'}",
+        "source.pace:=step", "source.rate:=5", "mapping.max_gaussians:=2000",
+        "vision.width:=160", "vision.height:=120",
     ]  # fmt: skip
     drawn: list[Camera] = []  # from where the figures' images were
 
@@ -375,8 +348,7 @@ def test_fits_and_figures_know_where_the_robot_says_the_scope_is(
 
     def off(number: int, camera: Camera) -> float:
         """m, from where the camera was in that frame."""
-        exact = camera_at(number / RATE, 5.0) @ rectified(np.eye(4), session.rig)
-        return float(np.linalg.norm(camera.T_world_cam[:3, 3] - exact[:3, 3]))
+        return float(np.linalg.norm((camera.T_world_cam - exact_pose(number, session))[:3, 3]))
 
     for frame in (*clip.train, *clip.test):
         assert off(frame.frame_id, frame.camera) < 0.1e-3

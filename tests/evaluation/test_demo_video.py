@@ -1,6 +1,8 @@
 """The demo's video: what the overlay kept of each frame, and the image that a display showed."""
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import av
 import numpy as np
@@ -20,16 +22,6 @@ from sags_node.types import U8
 RATE, HEIGHT, WIDTH = 30.0, 64, 81
 
 
-class Kept:
-    """Where a video is written to."""
-
-    def __init__(self) -> None:
-        self.pictures: list[U8] = []
-
-    def add(self, picture: U8) -> None:
-        self.pictures.append(picture.copy())
-
-
 def drawn(rng: np.random.Generator) -> U8:
     rgba = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
     rgba[10:30, 20:51] = rng.integers(0, 256, (20, 31, 4))
@@ -47,13 +39,14 @@ def test_a_display_shows_what_was_drawn_and_for_a_missed_frame_what_was_there_be
     layers.add(3, None)
     layers.close()
     assert (tmp_path / "layers").stat().st_size < rgba.nbytes / 4
-    kept = Kept()
-    shown = Shown(kept, read_layers(tmp_path / "layers"))  # type: ignore[arg-type]
+    kept: list[U8] = []
+    into: Any = SimpleNamespace(add=lambda picture: kept.append(picture.copy()))
+    shown = Shown(into, read_layers(tmp_path / "layers"))
     for frame_id, picture in enumerate(pictures):
         shown.add(frame_id, picture)
     with_it = over(pictures[1], rgba)
     assert (with_it != pictures[1]).any()
-    for got, expected in zip(kept.pictures, (pictures[0], with_it, with_it, pictures[3]), strict=True):
+    for got, expected in zip(kept, (pictures[0], with_it, with_it, pictures[3]), strict=True):
         np.testing.assert_array_equal(got, expected)
 
 

@@ -12,36 +12,25 @@ TIMES = {"p50": 38.6, "p90": 60.0, "p99": 96.9, "max": 313.8}
 def live() -> dict[str, Any]:
     """Of a demo, in the form of `summarise`."""
     return {
-        **{"session": "phantom", "frames": 300, "processed": 268, "held_out": 0, "dropped": 32},
-        **{"rate_hz": 27.57, "first_render_ms": 313.8, "latency_ms": TIMES, "frame_ms": TIMES},
+        "session": "phantom", "frames": 300, "processed": 268, "held_out": 0, "dropped": 32,
+        "rate_hz": 27.57, "first_render_ms": 313.8, "latency_ms": TIMES, "frame_ms": TIMES,
         "budget_ms": 33.33,
         "online": {"psnr": 34.61, "ssim": 0.9356, "lpips": None, "motion": {"psnr": 31.0, "ssim": 0.9}},
-        "predict": {
-            "psnr": 36.91,
-            "model_psnr": 33.65,
-            "copy_psnr": 35.84,
-            "motion": {"psnr": 29.9, "copy_psnr": 30.1},
-        },
+        "predict": {"psnr": 36.91, "model_psnr": 33.65, "copy_psnr": 35.84}
+        | {"motion": {"psnr": 29.9, "copy_psnr": 30.1}},
         "heldout": None,
-        "right": {
-            "psnr": 34.15,
-            "warp_psnr": 32.61,
-            "model_psnr": 31.61,
-            "copy_psnr": 41.59,
-            "coverage": 0.89,
-        },
+        "right": {"psnr": 34.15, "warp_psnr": 32.61, "model_psnr": 31.61, "copy_psnr": 41.59}
+        | {"coverage": 0.89},
         "hidden": {"psnr": 26.08, "copy_psnr": 25.32, "model_psnr": 22.85},
         "depth": {"median_mm": 0.2443, "p90_mm": 0.9778, "rmse_mm": 0.81, "coverage": 0.9906},
         "measured_depth": {"median_mm": 0.1721, "p90_mm": 0.64, "rmse_mm": 0.53, "coverage": 0.87},
         "track": {"median_mm": 0.3769, "p90_mm": 0.8802, "median_px": 1.9, "lost": 0.3297},
-        "gaussians": {"mean": 21510.0, "max": 92395},
-        "rungs": {1: 14, 2: 0, 3: 137, 14: 5},
-        "warnings": {"frames_missed": 16},
-        "segments": {"motion": [5, 9]},
+        "gaussians": {"mean": 21510.0, "max": 92395}, "rungs": {1: 14, 2: 0, 3: 137, 14: 5},
+        "warnings": {"frames_missed": 16}, "segments": {"motion": [5, 9]},
         "settings": {"depth_reference": "exact", "width": 640, "height": 512, "device": "cpu"},
         "machine": "AMD EPYC, 2 cores",
         "overlay": {"frames": 268, "overlay": 249, "blanked": {"being pinned": 19}, "latency_ms": TIMES},
-    }
+    }  # fmt: skip
 
 
 def test_a_verdict_has_what_an_overlay_needs_first_with_units_and_baselines() -> None:

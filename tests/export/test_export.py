@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import open3d
 import pytest
-from command_line import refused, sags
-from engine_scenes import rasterize
+from command_line import figures_of, refused, sags
+from engine_scenes import rasterize, rows
 from running_node import RunningNode
 from splat_files import splats_of
 
@@ -52,10 +52,10 @@ def scene(phantom_session: Path) -> Scene:
 @pytest.fixture(scope="module")
 def seen_at(phantom_session: Path) -> SeenAt:
     """Colours [N, 3] 0..1 that the left camera really saw where points [N, 3] (m) are."""
-    session = open_session(phantom_session, STEP)
-    pipeline = Pipeline(session.config, session.rig)
+    session = open_session(phantom_session, [*STEP, f"source.start:={FRAME / 10}", "source.frames:=1"])
     with session.source as source:
-        picture = pipeline.rectifier(next(frame for frame in source if frame.frame_id == FRAME)).left / 255
+        (frame,) = source
+    picture = Pipeline(session.config, session.rig).rectifier(frame).left / 255
 
     def at(scene: Scene, points: np.ndarray) -> np.ndarray:
         pixels = np.rint(project(scene.camera, points)[0]).astype(int)
@@ -102,29 +102,26 @@ def truth(phantom: Phantom) -> Truth:
 # ---- what is written -------------------------------------------------------------------------------------
 
 
-def test_splats_are_read_by_their_names_and_by_another_program(
-    phantom_session: Path, scene: Scene, tmp_path: Path
-) -> None:
+def test_splats_are_read_by_another_program(phantom_session: Path, scene: Scene, tmp_path: Path) -> None:
     file = tmp_path / "model.ply"
-    done = sags("export", phantom_session, *STEP, "--at", "2", "--splats", file, "--json")
-    assert done.exit_code == 0, done.stderr
-    (row,) = json.loads(done.stdout)
+    (row,) = figures_of("export", phantom_session, *STEP, "--at", "2", "--splats", file, "--json")
     gaussians, columns = with_constant_colours(scene.gaussians), splats_of(file)
     holds = len(columns["x"])  # in the file, where one of several colours is written as several
     assert row == {"file": str(file), "kind": "splats", "holds": holds, "bytes": file.stat().st_size}
-    means = np.stack([columns[axis] for axis in "xyz"], axis=1)
-    assert np.array_equal(means, gaussians.means)
-    assert np.allclose(np.exp([columns[f"scale_{i}"] for i in range(3)]).T, gaussians.scales, rtol=1e-5)
+
+    def of(*names: str) -> np.ndarray:
+        return np.stack([columns[name] for name in names], axis=1)
+
+    assert np.array_equal(of("x", "y", "z"), gaussians.means)
+    assert np.allclose(np.exp(of("scale_0", "scale_1", "scale_2")), gaussians.scales, rtol=1e-5)
     assert np.allclose(1 / (1 + np.exp(-columns["opacity"])), gaussians.opacities, atol=1e-5)
-    colors = 0.5 + SH_DEGREE_0 * np.stack([columns[f"f_dc_{i}"] for i in range(3)], axis=1)
+    colors = 0.5 + SH_DEGREE_0 * of("f_dc_0", "f_dc_1", "f_dc_2")
     assert np.allclose(colors, gaussians.colors, atol=1e-5)
-    assert np.array_equal(np.asarray(open3d.io.read_point_cloud(file).points, np.float32), means)
+    assert np.array_equal(np.float32(open3d.io.read_point_cloud(file).points), gaussians.means)
 
 
 @pytest.mark.parametrize("ending", [".ply", ".pcd"])
-def test_points_lie_on_the_surface_in_its_colours(
-    scene: Scene, truth: Truth, seen_at: SeenAt, tmp_path: Path, ending: str
-) -> None:
+def test_points_are_true(scene: Scene, truth: Truth, seen_at: SeenAt, tmp_path: Path, ending: str) -> None:
     file = tmp_path / f"points{ending}"
     count = export_surface.write_points(file, scene)
     cloud = open3d.io.read_point_cloud(file)
@@ -135,9 +132,7 @@ def test_points_lie_on_the_surface_in_its_colours(
 
 
 @pytest.mark.parametrize("ending", [".ply", ".pcd", ".obj", ".stl"])
-def test_colours_beyond_white_are_white_and_nobody_says_so(
-    scene: Scene, tmp_path: Path, ending: str, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_colours_beyond_white_are_white(scene: Scene, tmp_path: Path, ending: str, capfd: Any) -> None:
     """Live, the light of a moment ago leaves some."""
     bright = replace(scene, gaussians=replace(scene.gaussians, colors=scene.gaussians.colors + np.float32(2)))
     write = export_surface.write_points if ending == ".pcd" else export_surface.write_mesh
@@ -148,9 +143,7 @@ def test_colours_beyond_white_are_white_and_nobody_says_so(
 
 
 @pytest.mark.parametrize("ending", [".ply", ".obj", ".stl"])
-def test_the_mesh_is_the_true_surface(
-    scene: Scene, truth: Truth, seen_at: SeenAt, tmp_path: Path, ending: str
-) -> None:
+def test_the_mesh_is_true(scene: Scene, truth: Truth, seen_at: SeenAt, tmp_path: Path, ending: str) -> None:
     file = tmp_path / f"mesh{ending}"
     count = export_surface.write_mesh(file, scene)
     mesh = open3d.io.read_triangle_mesh(file)
@@ -181,9 +174,7 @@ def test_a_hole_of_the_model_is_a_hole_of_the_mesh(scene: Scene, tmp_path: Path)
     camera, middle, radius = scene.camera, np.array([150.0, 120.0]), 32.0
     pixels, _ = project(camera, scene.gaussians.means)
     kept = np.linalg.norm(pixels - middle, axis=1) > radius
-    fields = ("means", "quats", "scales", "opacities", "colors", "ids", "slopes")
-    left = replace(scene.gaussians, **{name: getattr(scene.gaussians, name)[kept] for name in fields})
-    export_surface.write_mesh(tmp_path / "hole.ply", replace(scene, gaussians=left))
+    export_surface.write_mesh(tmp_path / "hole.ply", replace(scene, gaussians=rows(scene.gaussians, kept)))
     mesh = open3d.io.read_triangle_mesh(tmp_path / "hole.ply")
     surface = raycasting(np.asarray(mesh.vertices), np.asarray(mesh.triangles))
 
@@ -236,9 +227,7 @@ def test_all_cameras_of_the_video_look_at_the_same_point(scene: Scene) -> None:
 
 
 @pytest.mark.live
-def test_a_running_node_is_exported_as_it_is_now(
-    phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_node_is_exported(phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Where time is short, a part of the image is as it was before the frame's step.
     depth = TopicName("left/render/depth", ReceivedImage)
     with RunningNode(phantom_session, tmp_path, "mapping.iterations:=1") as node:
@@ -272,25 +261,20 @@ def test_a_fit_is_exported_at_any_time(
     phantom_session: Path, phantom: Phantom, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(start, "PATH_STEPS", 100)  # ten frames are learnt sooner than a clip
-    session = (phantom_session, "source.frames:=10")
-    small = ("--iterations", "3", "--max-gaussians", "6000")
-    done = sags("fit", *session, "--out", tmp_path / "fit", *small, "--json")
-    assert done.exit_code == 0, done.stderr
+    session, fit = (phantom_session, "source.frames:=10"), tmp_path / "fit"
+    figures = figures_of("fit", *session, *"--iterations 3 --max-gaussians 6000 --json --out".split(), fit)
     splats, points = tmp_path / "splats.ply", tmp_path / "points.ply"
     for at, here, elsewhere in (("0.0", 0, 9), ("0.9", 9, 0)):
-        done = sags(
-            "export", *session, "--fit", tmp_path / "fit", "--at", at,
-            "--splats", splats, "--points", points, "--force",
-        )  # fmt: skip
+        files = ("--splats", splats, "--points", points, "--force")
+        done = sags("export", *session, "--fit", fit, "--at", at, *files)
         assert done.exit_code == 0, done.stderr
         cloud = np.asarray(open3d.io.read_point_cloud(points).points)
         near, far = (np.median(Truth(phantom, frame).distances(cloud)) for frame in (here, elsewhere))
         assert near < 0.5 and near < 0.5 * far  # the tissue moves by 0.9 mm between the two
-    figures = json.loads((tmp_path / "fit/figures.json").read_text())
     count = figures["gaussians"]
     assert count < len(splats_of(splats)["x"]) <= 2 * count  # steep ones in two
     for frames in (9, 11):
-        other = (phantom_session, f"source.frames:={frames}", "--fit", tmp_path / "fit")
+        other = (phantom_session, f"source.frames:={frames}", "--fit", fit)
         refused(2, "export", *other, "--splats", tmp_path / "new.ply", said=("frames",))
 
 
@@ -300,9 +284,7 @@ def test_a_fit_without_filters_is_drawn_without_them(phantom_session: Path, tmp_
     assert done.exit_code == 0, done.output
     session = open_session(phantom_session, ["source.pace:=step", "source.loop:=false", "source.frames:=4"])
     scene = from_fit(tmp_path, session, 0.1, lambda done, of, what: None)
-    shown = cv2.imread(str(tmp_path / "test/000001.png")).astype(float)[
-        ..., ::-1
-    ]  # held out, drawn by the fit
+    shown = cv2.imread(str(tmp_path / "test/000001.png"))[..., ::-1].astype(float)  # held out
 
     def off(each: Scene) -> float:
         drawn = colours_of(each.rasterizer().forward(each.gaussians, each.camera))

@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,18 +18,7 @@ from synthetic import plane_result
 from tiny_archive import TINY_FRAMES, write_tiny_session
 
 from sags_lab.lerobot.dataset import LeRobot, merge
-from sags_lab.lerobot.form import (
-    COARSE,
-    DEPTH,
-    LEFT,
-    POINTS,
-    POSE,
-    RIGHT,
-    TASK,
-    TISSUE,
-    VISIBILITY,
-    Version,
-)
+from sags_lab.lerobot.form import COARSE, DEPTH, LEFT, POINTS, POSE, RIGHT, TASK, TISSUE, VISIBILITY, Version
 from sags_lab.lerobot.stats import Sums, merged
 from sags_node.config.schema import ReferenceConfig
 from sags_node.errors import SagsError, UsageError
@@ -39,7 +29,7 @@ from sags_node.sources.source import open_source
 from sags_node.tools.export import sequence
 from sags_node.tools.export.played import DEPTH_UNIT, TRACKS
 from sags_node.tools.export.scene import Scene, from_session
-from sags_node.types import Camera, Gaussians, RectifiedPair
+from sags_node.types import Camera, FrameResult, Gaussians, RectifiedPair
 from sags_node.vision.rectify import Rectifier
 
 pq = pytest.importorskip("pyarrow.parquet", reason="the extra archive is not installed")
@@ -249,10 +239,9 @@ def test_statistics_of_several_episodes_are_those_of_all_their_numbers() -> None
 
 
 @pytest.fixture(scope="module")
-def darkened(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def darkened(exported: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session whose light is switched off: frames from `DARK_FROM` on, of both eyes, are black."""
-    folder = tmp_path_factory.mktemp("dark") / "session"
-    write_tiny_session(folder, seed=0)
+    folder = shutil.copytree(exported / "session0", tmp_path_factory.mktemp("dark") / "session")
     for eye in ("left", "right"):
         for file in sorted((folder / eye).iterdir())[DARK_FROM:]:
             cv2.imwrite(str(file), np.zeros_like(cv2.imread(str(file))))
@@ -276,27 +265,31 @@ def test_frames_that_were_not_taken_in_have_no_points(darkened: Path, tmp_path: 
         assert np.array_equal(rows[number][POSE], np.eye(4))  # this camera stands still
 
 
+def data_set(out: Path, *results: FrameResult) -> Path:
+    """These frames in the form of lerobot."""
+    episode = LeRobot(out, 10.0, "v3.0")
+    for number, result in enumerate(results):
+        episode.add(number, result, result.anchors)
+    assert episode.finish() == len(results)
+    return out
+
+
 def test_a_pose_that_the_robot_does_not_tell_is_not_the_last_one(tmp_path: Path) -> None:
     told = plane_result(stamp_ns=0)
     unknown = replace(told, held="no pose came", skipped={"pose": "no pose came"})
-    episode = LeRobot(tmp_path / "out", 10.0, "v3.0")
-    for number, result in enumerate((told, unknown)):
-        episode.add(number, result, result.anchors)
-    episode.finish()
-    (table,) = (tmp_path / "out/data").rglob("*.parquet")
+    (table,) = (data_set(tmp_path / "out", told, unknown) / "data").rglob("*.parquet")
     first, second = pq.read_table(table)[POSE].to_pylist()
     assert np.array_equal(first, np.float32(told.pair.camera.T_world_cam)) and np.isnan(second).all()
 
 
 def test_a_data_set_says_what_its_videos_are(tmp_path: Path) -> None:
+    """Also of images whose sides are odd."""
     told = plane_result(stamp_ns=0)
     camera = replace(told.pair.camera, width=told.pair.camera.width - 1, height=told.pair.camera.height - 1)
-    odd = replace(told.pair, camera=camera, left=told.pair.left[:-1, :-1], right=None)
-    episode = LeRobot(tmp_path / "out", 10.0, "v3.0")
-    episode.add(0, replace(told, pair=odd), told.anchors)
-    episode.finish()
-    info = json.loads((tmp_path / "out/meta/info.json").read_text())["features"][LEFT]
-    (video,) = (tmp_path / "out/videos").rglob("*.mp4")
+    pair = replace(told.pair, camera=camera, left=told.pair.left[:-1, :-1], right=None)
+    out = data_set(tmp_path / "out", replace(told, pair=pair))
+    info = json.loads((out / "meta/info.json").read_text())["features"][LEFT]
+    (video,) = (out / "videos").rglob("*.mp4")
     with av.open(str(video)) as opened:
         stream = opened.streams.video[0]
         assert info["shape"] == [stream.height, stream.width, 3]
@@ -304,9 +297,7 @@ def test_a_data_set_says_what_its_videos_are(tmp_path: Path) -> None:
         assert info["info"]["video.pix_fmt"] == stream.pix_fmt
 
 
-def test_the_model_is_exported_of_frames_that_were_taken_in(
-    darkened: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_no_dark_frame_is_exported(darkened: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     command = ("export", darkened, "mapping.iterations:=1")
     last = (DARK_FROM - 1) / 10  # s
     mistake = (f"at {last + 0.2:.2f} s was not taken in", "black", f"--at {last:g}")
@@ -326,16 +317,13 @@ STAMPS = (0, 0.1, 0.2, 5.2, 5.3, 5.4)  # s; the recording paused
 
 
 @pytest.mark.fault("stamp: a recording that paused is exported as a video")
-def test_videos_have_the_recordings_own_stamps(tmp_path: Path) -> None:
-    session = tmp_path / "session"
-    write_tiny_session(session, seed=0)
-    shutil.rmtree(session / "tools")
+def test_videos_have_the_recordings_own_stamps(exported: Path, tmp_path: Path) -> None:
+    for part in ("left", "right", "calib"):
+        shutil.copytree(exported / "session0" / part, tmp_path / "session" / part)
     for eye in ("left", "right"):
-        for file, at in zip(sorted((session / eye).iterdir()), STAMPS, strict=True):
+        for file, at in zip(sorted((tmp_path / "session" / eye).iterdir()), STAMPS, strict=True):
             file.rename(file.with_name(f"{1_700_000_000_000_000_000 + round(at * 1e9)}{file.suffix}"))
-    played = {"source": {"kind": "folders", "left": "left", "right": "right"}, "rig": "calib"}
-    (session / "launch.yaml").write_text(json.dumps(played))
-    command = ("export", session, "mapping.iterations:=1")
+    command = ("export", tmp_path / "session", "mapping.iterations:=1")
     assert sags(*command, "--render", tmp_path / "model.mp4").exit_code == 0
     assert times_of(tmp_path / "model.mp4") == pytest.approx(STAMPS, abs=1e-3)
     assert sags(*command, "--sequence", tmp_path / "all").exit_code == 0
@@ -353,22 +341,15 @@ def times_of(video: Path) -> list[float]:
     ("rate", "fits"), [(30.0, True), (29.97, True), (1000 / 33, True), (12.5, False), (0.5, False)]
 )
 def test_lerobot_takes_whole_rates(tmp_path: Path, rate: float, fits: bool) -> None:
-    if fits:
+    said = f"{rate:g} frames a second are recorded; set source.rate"
+    with nullcontext() if fits else pytest.raises(UsageError, match=said):
         LeRobot(tmp_path / "out", rate, "v3.0")
-    else:
-        with pytest.raises(UsageError, match=f"{rate:g} frames a second are recorded; set source.rate"):
-            LeRobot(tmp_path / "out", rate, "v3.0")
 
 
 @pytest.mark.parametrize("paused", [False, True])
-def test_gaps_that_lerobot_does_not_know_are_told(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, paused: bool
-) -> None:
-    episode = LeRobot(tmp_path / "out", 10.0, "v3.0")
-    for number, at in enumerate(STAMPS if paused else np.arange(6) * 0.11):
-        result = plane_result(stamp_ns=round(at * 1e9))
-        episode.add(number, result, result.anchors)
-    assert episode.finish() == len(STAMPS)
+def test_gaps_in_time_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture, paused: bool) -> None:
+    stamps = STAMPS if paused else np.arange(6) * 0.11
+    data_set(tmp_path / "out", *(plane_result(stamp_ns=round(at * 1e9)) for at in stamps))
     assert ("1 of 5 steps" in caplog.text and "5.0 s" in caplog.text) if paused else not caplog.text
 
 
@@ -397,11 +378,11 @@ def scenes(count: int = FRAMES) -> Iterator[Scene]:
 
 
 def written(folder: Path, count: int = FRAMES) -> list[dict[str, Any]]:
+    sequence.check_sequence(folder, {"session": "a"}, force=False)
     return sequence.write_sequence(folder, scenes(count), 30.0, count, lambda *said: None)
 
 
 def test_every_frame_that_shows_something_is_a_file_and_the_video_comes_back(tmp_path: Path) -> None:
-    sequence.check_sequence(tmp_path / "out", {"session": "a"}, force=False)
     frames, loop = written(tmp_path / "out")
     assert frames["holds"] == FRAMES - 1 and loop["holds"] == 2 * (FRAMES - 1) - 2
     for frame in range(1, FRAMES):
@@ -416,35 +397,29 @@ def test_every_frame_that_shows_something_is_a_file_and_the_video_comes_back(tmp
 
 @pytest.mark.fault("disk: full while frames are exported")
 def test_an_export_that_a_full_disk_ended_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = write_ply
-    left = [3]
+    room = iter(range(3))
 
     def full(path: Path, gaussians: Gaussians) -> None:
-        left[0] -= 1
-        if left[0] < 0:
+        if next(room, None) is None:
             raise SagsError(f"cannot write {path}: No space left on device")
-        real(path, gaussians)
+        write_ply(path, gaussians)
 
-    monkeypatch.setattr(sequence, "write_ply", full)
-    sequence.check_sequence(tmp_path, {"session": "a"}, force=False)
-    with pytest.raises(
-        SagsError, match=r"No space left on device.*3 frames are there; the same command goes on"
-    ):
+    said = r"No space left on device.*3 frames are there; the same command goes on"
+    with monkeypatch.context() as patched, pytest.raises(SagsError, match=said):
+        patched.setattr(sequence, "write_ply", full)
         written(tmp_path)
     done = sorted(file.name for file in tmp_path.iterdir())
     assert done == [*(f"frame_{n:05d}.ply" for n in (1, 2, 3)), "sequence.json"]  # nothing half written
     stamps = {name: (tmp_path / name).stat().st_mtime_ns for name in done[:3]}
-
-    monkeypatch.setattr(sequence, "write_ply", real)
-    sequence.check_sequence(tmp_path, {"session": "a"}, force=False)
     assert written(tmp_path)[0]["holds"] == FRAMES - 1
     assert {name: (tmp_path / name).stat().st_mtime_ns for name in stamps} == stamps
 
 
-def test_a_recording_of_the_same_name_is_another_one(tmp_path: Path) -> None:
-    first, second = (tmp_path / patient / "clip" for patient in ("anna", "bert"))
-    for seed, folder in enumerate((first, second)):
-        write_tiny_session(folder, seed)
+def test_a_recording_of_the_same_name_is_another_one(exported: Path, tmp_path: Path) -> None:
+    first, second = (
+        shutil.copytree(exported / f"session{number}", tmp_path / patient / "clip")
+        for number, patient in enumerate(("anna", "bert"))
+    )
     into = ("source.frames:=2", "--sequence", tmp_path / "out")
     assert sags("export", first, *into).exit_code == 0
     refused(2, "export", second, *into, said=("holds another sequence", "--force"))
@@ -452,10 +427,9 @@ def test_a_recording_of_the_same_name_is_another_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("changed", ["launch.yaml", "calib/left.yaml"])
 def test_what_the_frames_are_made_from_is_another_when_a_file_was_changed(
-    tmp_path: Path, changed: str, caplog: pytest.LogCaptureFixture
+    exported: Path, tmp_path: Path, changed: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    recording = tmp_path / "clip"
-    write_tiny_session(recording, seed=0)
+    recording = shutil.copytree(exported / "session0", tmp_path / "clip")
     command = ("export", recording, "source.frames:=2", "--sequence", tmp_path / "out")
     first = tmp_path / "out/frame_00000.ply"
     assert sags(*command).exit_code == 0
@@ -474,11 +448,8 @@ def test_what_the_frames_are_made_from_is_another_when_a_file_was_changed(
     assert first.read_bytes() != before[1]
 
 
-def test_the_state_of_a_sequence_tells_one_fit_and_version_from_the_next(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_tiny_session(tmp_path / "clip", seed=0)
-    session = open_session(tmp_path / "clip", ["source.pace:=step"])
+def test_states_tell_fits_apart(exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    session = open_session(exported / "session0", ["source.pace:=step"])
     with pytest.raises(UsageError, match=r"there is no .*checkpoint\.npz"):
         sequence.state_of(session, tmp_path)
     states = []
@@ -493,31 +464,27 @@ def test_the_state_of_a_sequence_tells_one_fit_and_version_from_the_next(
     session.source.stop()
 
 
-def test_a_time_of_whole_milliseconds_is_that_of_its_frame(tmp_path: Path) -> None:
+def test_a_time_of_whole_milliseconds_is_that_of_its_frame(exported: Path) -> None:
     """0.067 s are 67000000.00000001 ns: the frame of that stamp lay before them."""
-    write_tiny_session(tmp_path / "clip", seed=0)
-    session = open_session(tmp_path / "clip", ["source.pace:=step", f"source.rate:={1000 / 67}"])
+    session = open_session(exported / "session0", ["source.pace:=step", f"source.rate:={1000 / 67}"])
     assert from_session(session, 0.067, lambda *said: None).t_capture_ns == 67_000_000
 
 
 def test_files_of_something_else_stay_unless_forced(tmp_path: Path) -> None:
-    sequence.check_sequence(tmp_path, {"session": "a"}, force=False)
-    written(tmp_path)
+    written(tmp_path / "ours")
     with pytest.raises(UsageError, match="another sequence"):
-        sequence.check_sequence(tmp_path, {"session": "b"}, force=False)
-    assert (tmp_path / "frame_00001.ply").exists()
-    for about in ({"session": "b"}, {"session": "b"}):  # of the same state, too
-        sequence.check_sequence(tmp_path, about, force=True)
-        assert not (tmp_path / "frame_00001.ply").exists()
-        written(tmp_path)
-    foreign = tmp_path / "theirs"
-    foreign.mkdir()
-    (foreign / "note.txt").write_text("mine")
+        sequence.check_sequence(tmp_path / "ours", {"session": "b"}, force=False)
+    for state in ("b", "a"):  # of the same state, too
+        assert (tmp_path / "ours/frame_00001.ply").exists()
+        sequence.check_sequence(tmp_path / "ours", {"session": state}, force=True)
+        assert not (tmp_path / "ours/frame_00001.ply").exists()
+        sequence.check_sequence(tmp_path / "ours", {"session": "a"}, force=True)
+        written(tmp_path / "ours")
+    (tmp_path / "note.txt").write_text("mine")
     with pytest.raises(UsageError, match="not empty"):
-        sequence.check_sequence(foreign, {"session": "a"}, force=False)
+        sequence.check_sequence(tmp_path, {"session": "a"}, force=False)
 
 
 def test_a_recording_that_shows_nothing_is_an_error(tmp_path: Path) -> None:
-    sequence.check_sequence(tmp_path, {"session": "a"}, force=False)
     with pytest.raises(SagsError, match="no frame shows anything"):
         written(tmp_path, count=1)

@@ -28,13 +28,7 @@ SETTINGS = dataclasses.replace(
     shape=FieldShape(cells=16, channels=16, frames_per_slot=2, xavier=True),
     growth=dataclasses.replace(PAPER.growth, first=150, every=3, until=1),
 )  # fmt: skip
-SMALL = [
-    "source.pace:=step",
-    "source.loop:=false",
-    "source.frames:=5",
-    "vision.width:=80",
-    "vision.height:=64",
-]
+SMALL = "source.pace:=step source.loop:=false source.frames:=5 vision.width:=80 vision.height:=64".split()
 
 
 @pytest.fixture(scope="module")

@@ -88,19 +88,22 @@ def test_a_change_that_cannot_be_says_why(change: str, said: str) -> None:
         with_changes(ONLINE, [change])
 
 
+WITHOUT_EFFECT = {
+    "rates.decaying": "[means]", "growth": "7", "weights": "0.2", "slopes": "true", "coarse": "0.5",
+    "stable": "0.5", "smooth_everywhere": "true",
+}  # fmt: skip
+
+
 @pytest.mark.parametrize("key", ONLY_PAPER)
 def test_a_setting_without_effect_is_refused(key: str) -> None:
     """What only the paper's schedule reads; and what only some of its settings do."""
-    other = {"rates.decaying": "[means]", "growth": "7", "weights": "0.2", "slopes": "true"}
     part = {"growth": ".every", "weights": ".color"}.get(key, "")
-    change = f"{key}{part}={other.get(key, '0.5' if key in ('coarse', 'stable') else '9')}"
-    changes = [change, "color_softness=0.1"] if key == "slopes" else [change]
-    if key == "smooth_everywhere":
-        changes = ["smooth_everywhere=true"]
+    change = f"{key}{part}={WITHOUT_EFFECT.get(key, '9')}"
     with pytest.raises(UsageError, match=rf"{key}.* nothing after an online start; give --schedule paper"):
-        check_used(with_changes(ONLINE, changes), ONLINE)
-    released = dataclasses.replace(RELEASED, slopes=False, stable=None)
-    check_used(with_changes(released, [change for change in changes if "slopes" not in change]), RELEASED)
+        check_used(with_changes(ONLINE, [change, "color_softness=0.1"][: 1 + (key == "slopes")]), ONLINE)
+    if key != "slopes":
+        released = dataclasses.replace(RELEASED, slopes=False, stable=None)
+        check_used(with_changes(released, [change]), RELEASED)
 
 
 def test_settings_that_hide_others_are_said() -> None:

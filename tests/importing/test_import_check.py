@@ -4,9 +4,11 @@ import json
 import re
 import shlex
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -39,8 +41,10 @@ def texture(seed: int, shift: int = 0) -> U8:
     return cut
 
 
-def made(folder: Path) -> Path:
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
     """A sound recording: rectified images of both eyes in two kinds of files, masks and depth in 1e-5 m."""
+    folder = tmp_path / "case"
     for side in ("left", "right", "masks", "depth"):
         (folder / side).mkdir(parents=True)
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
@@ -60,24 +64,23 @@ def odd(folder: Path, *overrides: str) -> list[Finding]:
     return [each for each in found if each.level != "ok" and "no calibration" not in each.what]
 
 
-def edit(folder: Path, change: object) -> None:
-    for file in folder.iterdir():
-        picture = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-        assert callable(change)
-        cv2.imwrite(str(file), change(picture))
+def edited(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
+    """All images of that folder are changed."""
+
+    def edit(folder: Path) -> None:
+        for file in (folder / name).iterdir():
+            cv2.imwrite(str(file), change(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)))
+
+    return edit
 
 
-def test_a_sound_folder(tmp_path: Path) -> None:
-    found = check_folder(made(tmp_path / "case"))
+def test_a_sound_folder(folder: Path) -> None:
+    found = check_folder(folder)
     assert [each.what for each in found if each.level != "ok"] == ["no calibration lies beside the images"]
     said = "\n".join(each.what for each in found)
     assert "4 images each" in said and f"disparity {DISPARITY}.0 px, rows agree" in said
     assert "80 mm with 1e-05 m per count" in said and "10% of the image is instrument" in said
     assert "source.left:=" in found[-1].what and "source.tools:=" in found[-1].what
-
-
-def invert(mask: U8) -> U8:
-    return 255 - mask
 
 
 def interlaced(folder: Path) -> None:
@@ -88,12 +91,8 @@ def interlaced(folder: Path) -> None:
 
 
 def bordered(folder: Path) -> None:
-    def border(picture: U8) -> U8:
-        picture[:, :20] = 3
-        return picture
-
     for side in ("left", "right"):
-        edit(folder / side, border)
+        edited(side, lambda picture: cv2.rectangle(picture, (0, 0), (19, HEIGHT), (3, 3, 3), -1))(folder)
 
 
 def gap(folder: Path) -> None:
@@ -107,74 +106,67 @@ def exchanged(folder: Path) -> None:
     (folder / "there").rename(folder / "right")
 
 
-PLANTED = {
+def depth_of_floats(folder: Path) -> None:
+    for file in list((folder / "depth").iterdir()):
+        file.unlink()
+        cv2.imwrite(str(file.with_suffix(".tiff")), np.full((HEIGHT, WIDTH), 0.08, np.float32))
+
+
+def one_eye_twice(folder: Path) -> None:
+    shutil.rmtree(folder / "right")
+    shutil.copytree(folder / "left", folder / "right")
+
+
+def cut_off(folder: Path) -> None:
+    (folder / "left/000.bmp").write_bytes((folder / "left/000.bmp").read_bytes()[:5000])
+
+
+def dead_link(folder: Path) -> None:
+    """As in a data set whose files were not all fetched."""
+    (folder / "left/000.bmp").unlink()
+    (folder / "left/000.bmp").symlink_to("gone")
+
+
+# What is done to the folder; what is said of it, and its fix.
+PLANTED: dict[str, tuple[Callable[[Path], object], str, str]] = {
     "masks_inverted": (
-        lambda folder: edit(folder / "masks", invert),
-        "polarity",
-        "source.instruments:=black",
+        edited("masks", lambda mask: 255 - mask), "polarity", "source.instruments:=black"
     ),
     "masks_of_ones": (
-        lambda folder: edit(folder / "masks", lambda mask: mask // 255),
-        "masks/000.png holds the values 0, 1, which do not tell",
-        "source.instruments:=[1]",
+        edited("masks", lambda mask: mask // 255),
+        "masks/000.png holds the values 0, 1, which do not tell", "source.instruments:=[1]",
     ),
     "masks_of_nothing": (
-        lambda folder: edit(folder / "masks", np.zeros_like),
-        "none of 4 masks that were looked at marks an instrument",
-        "leave masks out",
+        edited("masks", np.zeros_like),
+        "none of 4 masks that were looked at marks an instrument", "leave masks out",
     ),
     "masks_small": (
-        lambda folder: edit(folder / "masks", lambda mask: mask[::2, ::2]),
-        "masks/000.png is 80x60 px but",
-        "one size",
+        edited("masks", lambda mask: mask[::2, ::2]), "masks/000.png is 80x60 px but", "one size"
     ),
     "depth_is_disparity": (
-        lambda folder: edit(folder / "depth", lambda depth: np.full_like(depth, 2)),
-        "no distance in an endoscope's view",
-        "disparity",
+        edited("depth", lambda depth: np.full_like(depth, 2)),
+        "no distance in an endoscope's view", "disparity",
     ),
     "depth_coloured": (
-        lambda folder: edit(folder / "depth", lambda depth: np.dstack([depth] * 3)),
-        "has 3 channels",
-        "grey",
+        edited("depth", lambda depth: np.dstack([depth] * 3)), "has 3 channels", "grey"
     ),
-    "depth_of_floats": (
-        lambda folder: [
-            cv2.imwrite(str(file.with_suffix(".tiff")), np.full((HEIGHT, WIDTH), 0.08, np.float32))
-            and file.unlink()
-            for file in list((folder / "depth").iterdir())
-        ],
-        "holds floating numbers",
-        "16 bit",
-    ),
+    "depth_of_floats": (depth_of_floats, "holds floating numbers", "16 bit"),
     "right_one_missing": (
         lambda folder: (folder / "right/002.tiff").unlink(),
-        "have no partner of their name, e.g. ",
-        "they are left out",
+        "have no partner of their name, e.g. ", "they are left out",
     ),
     "gap": (gap, "gaps in the numbers, first between 002", "gap"),
-    "cut_off": (
-        lambda folder: (folder / "left/000.bmp").write_bytes((folder / "left/000.bmp").read_bytes()[:5000]),
-        "damaged or cut off",
-        "replace",
-    ),
-    "same_picture": (
-        lambda folder: (
-            shutil.copytree(folder / "left", folder / "right", dirs_exist_ok=True)
-            and [file.unlink() for file in (folder / "right").glob("*.tiff")]
-        ),
-        "both eyes get the same image",
-        "source.right",
-    ),
+    "cut_off": (cut_off, "damaged or cut off", "replace"),
+    "dead_link": (dead_link, "cannot read image", "left/000.bmp"),
+    "one_eye_twice": (one_eye_twice, "both eyes get the same image", "source.right"),
     "exchanged": (exchanged, "eyes exchanged", "exchange left and right"),
     "interlaced": (interlaced, "left: interlaced", "deinterlace"),
     "borders": (bordered, "black borders; the image is 140x120 px at 20,0", "[20,0,140,120]"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", PLANTED)
-def test_a_planted_oddity_is_named_with_its_fix(name: str, tmp_path: Path) -> None:
-    folder = made(tmp_path / "case")
+def test_a_planted_oddity_is_named_with_its_fix(name: str, folder: Path) -> None:
     plant, what, fix = PLANTED[name]
     plant(folder)
     found = odd(folder)
@@ -186,47 +178,45 @@ def test_a_planted_oddity_is_named_with_its_fix(name: str, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("kind", ["pictures", "videos"])
-def test_check_says_what_run_says(kind: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    if kind == "pictures":
-        gap(made(tmp_path))
-        edit(tmp_path / "masks", np.zeros_like)
-    for side in ("left", "right") if kind == "videos" else ():
-        shown = [number / 25 + 2 * (number > 9) for number in range(20)]
-        write(
-            tmp_path / f"{side}.mkv", moving(20, -DISPARITY * (side == "right")), shown, aspect=Fraction(4, 3)
-        )
-    assert not is_refused(tmp_path)
+def test_check_says_what_run_says(kind: str, folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    played = folder if kind == "pictures" else folder.with_name("videos")
+    gap(folder)
+    edited("masks", np.zeros_like)(folder)
+    folder.with_name("videos").mkdir()
+    shown = [number / 25 + 2 * (number > 9) for number in range(20)]
+    for side, shift in (("left", 0), ("right", -DISPARITY)):
+        write(folder.with_name("videos") / f"{side}.mkv", moving(20, shift), shown, aspect=Fraction(4, 3))
+    assert not is_refused(played)
     said = {record.getMessage() for record in caplog.records}
-    checked = {f"{each.what}; {each.fix}" for each in odd(tmp_path)}
+    checked = {f"{each.what}; {each.fix}" for each in odd(played)}
     once = {each for each in said if "right.mkv" in each}  # the check has said it of the left one
     assert len(said) == 2 + len(once) == (3 if kind == "videos" else 2) and said - checked == once
 
 
 @pytest.mark.parametrize("has_rig", [True, False])  # else a camera is guessed from some images
-def test_a_run_says_all_again_after_a_check_and_after_a_run(
-    has_rig: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    gap(made(tmp_path))
+def test_a_run_says_it_all_again(has_rig: bool, folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    gap(folder)
     if has_rig:
-        shutil.copytree(SESSION / "calib", tmp_path / "calib")
+        shutil.copytree(SESSION / "calib", folder / "calib")
     for _ in range(2):
-        check_folder(tmp_path)
+        check_folder(folder)
         caplog.clear()
-        assert not is_refused(tmp_path)
+        assert not is_refused(folder)
         assert [record.getMessage().count("gaps in the numbers") for record in caplog.records].count(1) == 1
 
 
-def test_a_rate_that_nobody_told_is_called_assumed(tmp_path: Path) -> None:
+def test_a_rate_that_nobody_told_is_called_assumed(folder: Path) -> None:
     """Names that are times tell it; so does who sets it."""
-    made(tmp_path)
-    told = [["source.rate:=30"], []]
-    said = [next(each.what for each in check_folder(tmp_path, each) if " Hz" in each.what) for each in told]
+
+    def said(*overrides: str) -> str:
+        return next(each.what for each in check_folder(folder, overrides) if " Hz" in each.what)
+
     size = f"{FRAMES} frames of {WIDTH}x{HEIGHT} px at 30 Hz"
-    assert said == [size, f"{size} (assumed: the files do not say it; set source.rate)"]
-    for folder in ("left", "right", "masks", "depth"):
-        for file in (tmp_path / folder).iterdir():
-            file.rename(file.with_stem(f"{1_700_000_000 + int(file.stem)}"))
-    assert next(each.what for each in check_folder(tmp_path) if " Hz" in each.what).endswith("at 1 Hz")
+    assert said("source.rate:=30") == size
+    assert said() == f"{size} (assumed: the files do not say it; set source.rate)"
+    for file in list(folder.rglob("*.*")):
+        file.rename(file.with_stem(f"{1_700_000_000 + int(file.stem)}"))
+    assert said().endswith("at 1 Hz")
 
 
 def is_refused(folder: Path) -> bool:
@@ -253,8 +243,7 @@ def test_a_copy_that_broke_off_is_found_among_many(tmp_path: Path) -> None:
         assert broken in finding.what and "cut off" in finding.what and "replace" in finding.fix
 
 
-def test_one_broken_file_is_said_once(tmp_path: Path) -> None:
-    folder = made(tmp_path / "case")
+def test_one_broken_file_is_said_once(folder: Path) -> None:
     (folder / "left/000.bmp").write_bytes(b"")
     shutil.copytree(SESSION / "calib", folder / "calib")
     assert sum("000.bmp" in each.what for each in check_folder(folder)) == 1
@@ -263,20 +252,13 @@ def test_one_broken_file_is_said_once(tmp_path: Path) -> None:
     assert overrides_of(folder)[-1] == f"rig:={folder / 'calib'}"
 
 
-def test_a_semicolon_in_a_name_does_not_part_a_message(tmp_path: Path) -> None:
-    folder = made(tmp_path / "case; old")
-    (folder / "left/000.bmp").rename(folder / "left/000; cut.bmp")
-    (folder / "left/000; cut.bmp").write_bytes(b"")
-    (error,) = [each for each in check_folder(folder) if each.level == "error"]
-    assert str(folder / "left/000; cut.bmp") in error.what
-    assert error.fix == "replace or remove the pair"
-    there = folder / "left"
+def test_a_semicolon_in_a_name_does_not_part_a_message(folder: Path) -> None:
+    there = folder.rename(folder.with_name("case; old")) / "left"
+    (there / "000.bmp").rename(there / "000; cut.bmp").write_bytes(b"")
+    (error,) = [each for each in check_folder(there.parent) if each.level == "error"]
+    assert str(there / "000; cut.bmp") in error.what and error.fix == "replace or remove the pair"
     for message, what, fix in (
-        (
-            f"{there}: 2 gaps; look at '{there}'; fill them",
-            f"{there}: 2 gaps",
-            f"look at '{there}'; fill them",
-        ),
+        (f"{there}: 2 gaps; see '{there}'; fill them", f"{there}: 2 gaps", f"see '{there}'; fill them"),
         (f"cannot read {there}", f"cannot read {there}", ""),
         (f"images of {there} are odd; {there.parent}", f"images of {there} are odd", str(there.parent)),
         ("one; two; three", "one", "two; three"),
@@ -284,87 +266,70 @@ def test_a_semicolon_in_a_name_does_not_part_a_message(tmp_path: Path) -> None:
         assert parted("error", message) == Finding("error", what, fix)
 
 
-def test_what_macos_writes_beside_files_is_passed_over(tmp_path: Path) -> None:
-    (tmp_path / "videos").mkdir()
-    for name in ("left", "right"):
-        write(tmp_path / f"videos/{name}.mp4", moving(5, -DISPARITY * (name == "right")))
-    for folder in (made(tmp_path / "pictures"), tmp_path / "videos"):
-        for file in [each for each in folder.rglob("*") if each.is_file()]:
+def test_what_macos_writes_beside_files_is_passed_over(folder: Path, tmp_path: Path) -> None:
+    videos = write_eyes(tmp_path / "videos", moving(5), moving(5, -DISPARITY))
+    for played in (folder, videos):
+        for file in [each for each in played.rglob("*") if each.is_file()]:
             file.with_name(f"._{file.name}").write_bytes(b"\0\5\26\7\0\2\0\0Mac OS X")
-        assert not odd(folder) and not is_refused(folder)
+        assert not odd(played) and not is_refused(played)
+    said = check_folder(videos)
+    assert f"source.left:={videos / 'left.avi'} source.right:={videos / 'right.avi'}" in said[-1].what
+    assert any("disparity" in each.what for each in said)
 
 
-def test_a_calibration_of_any_name_in_its_folder_is_used(tmp_path: Path) -> None:
-    folder = made(tmp_path / "case")
-    for name, is_used in (("calib/endoscope.yml", True), ("other.yml", False), ("my_calib.yml", True)):
-        (folder / name).parent.mkdir(exist_ok=True)
-        (folder / name).write_text("%YAML:1.0\n---\n")
-        found = check_folder(folder)
-        assert any(name in each.what for each in found if each.level == "error") == is_used
-        (folder / name).unlink()
+@pytest.mark.parametrize(
+    ("name", "is_used"), [("calib/endoscope.yml", True), ("other.yml", False), ("my_calib.yml", True)]
+)
+def test_a_calibration_of_any_name_in_its_folder_is_used(name: str, is_used: bool, folder: Path) -> None:
+    (folder / name).parent.mkdir(exist_ok=True)
+    (folder / name).write_text("%YAML:1.0\n---\n")
+    assert any(name in each.what for each in check_folder(folder) if each.level == "error") == is_used
 
 
-@pytest.mark.parametrize(("left", "right"), [("image_02", "image_03"), ("image_0", "image_1")])
-def test_folders_of_kitti_are_known_and_others_are_asked_for(left: str, right: str, tmp_path: Path) -> None:
-    folder = made(tmp_path / "case")
+@pytest.mark.parametrize(
+    ("left", "right"), [("image_02", "image_03"), ("image_0", "image_1"), ("cam_left", "cam_right")]
+)
+def test_folders_of_both_eyes_are_known_and_others_are_asked_for(left: str, right: str, folder: Path) -> None:
     (folder / "left").rename(folder / left)
     (folder / "right").rename(folder / right)
     assert f"source.right:={folder / right}" in overrides_of(folder)
+    assert "two folders" in check_folder(folder)[0].what
     (folder / right).rename(folder / "cam7")
     (error,) = check_folder(folder)
-    assert (
-        error.fix.startswith("name those of both eyes, the left one first: sags new") and "cam7" in error.fix
-    )
+    assert error.fix.startswith("name those of both eyes, the left one first: sags new")
+    assert "cam7" in error.fix
 
 
-def test_eyes_are_told_by_names(tmp_path: Path) -> None:
-    folder = made(tmp_path / "folders")
-    (folder / "left").rename(folder / "cam_left")
-    (folder / "right").rename(folder / "cam_right")
-    found = check_folder(folder)
-    assert "two folders" in found[0].what and f"source.right:={folder / 'cam_right'}" in found[-1].what
-    for left, right in (("{:03}l", "{:03}r"), ("left_{}", "right_{}"), ("a_L_{}", "a_R_{}")):
-        folder = tmp_path / left
-        folder.mkdir()
-        for number in range(FRAMES):
-            cv2.imwrite(str(folder / f"{left.format(number)}.png"), texture(number))
-            cv2.imwrite(str(folder / f"{right.format(number)}.png"), texture(number, -DISPARITY))
-        cv2.imwrite(str(folder / "mask_left.png"), texture(0))
-        found = check_folder(folder)
-        assert f"of both eyes, {FRAMES} pairs, in one folder" in found[0].what
-        assert any(f"disparity {DISPARITY}" in each.what for each in found), found
-
-
-def test_a_link_that_leads_nowhere_is_a_picture_that_cannot_be_read(tmp_path: Path) -> None:
-    """As in a data set whose files were not all fetched."""
-    file = made(tmp_path) / "left/001.bmp"
-    file.unlink()
-    file.symlink_to("gone")
-    assert f"cannot read image {file}" in str([each for each in odd(tmp_path) if each.level == "error"])
+@pytest.mark.parametrize("names", ["{:03}l {:03}r", "left_{} right_{}", "a_L_{} a_R_{}"])
+def test_eyes_are_told_by_names_of_files(names: str, tmp_path: Path) -> None:
+    for number in range(FRAMES):
+        for name, shift in zip(names.split(), (0, -DISPARITY), strict=True):
+            cv2.imwrite(str(tmp_path / f"{name.format(number)}.png"), texture(number, shift))
+    cv2.imwrite(str(tmp_path / "mask_left.png"), texture(0))
+    found = check_folder(tmp_path)
+    assert f"of both eyes, {FRAMES} pairs, in one folder" in found[0].what
+    assert any(f"disparity {DISPARITY}" in each.what for each in found), found
 
 
 def shown(left: U8, right: U8) -> dict[str, tuple[U8, str]]:
     """Both eyes in one image, and how that is played."""
-    rows = left.copy()
+    rows, dark = left.copy(), np.full_like(left, 20)
     rows[1::2] = right[1::2]
-    dark = np.full_like(left, 20)
+    panes, below = "layout:=panes source.geometry.crop", np.hstack([dark, left])
+    one, other = (f":=[{x},0,{2 * WIDTH},{2 * HEIGHT}]" for x in (0, 2 * WIDTH))
     return {
         "side by side": (np.hstack([left, right]), "layout:=side_by_side"),
         "exchanged": (np.hstack([right, left]), "layout:=side_by_side source.geometry.first:=right"),
         "above": (np.vstack([left, right]), "layout:=over_under"),
         "rows": (rows, "layout:=row_interleaved"),
         "panes": (
-            np.vstack([np.hstack([left, right]), np.hstack([dark, left])]),
-            f"layout:=panes source.geometry.crop:=[0,0,{2 * WIDTH},{2 * HEIGHT}] "
-            f"source.geometry.crop_right:=[{2 * WIDTH},0,{2 * WIDTH},{2 * HEIGHT}]",
+            np.vstack([np.hstack([left, right]), below]), f"{panes}{one} source.geometry.crop_right{other}"
         ),
         "panes exchanged": (
-            np.vstack([np.hstack([right, left]), np.hstack([dark, left])]),
-            f"layout:=panes source.geometry.crop:=[{2 * WIDTH},0,{2 * WIDTH},{2 * HEIGHT}] "
-            f"source.geometry.crop_right:=[0,0,{2 * WIDTH},{2 * HEIGHT}]",
+            np.vstack([np.hstack([right, left]), below]), f"{panes}{other} source.geometry.crop_right{one}"
         ),
         "one eye": (left, "layout:=side_by_side shows what is in it"),  # not played: the fix
-    }
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", shown(texture(0), texture(0)))
@@ -413,42 +378,24 @@ def test_two_parts_of_a_recording_are_no_pair(tmp_path: Path) -> None:
     assert "side_by_side" in overrides_of(tmp_path / "REC0001.avi")[-1]
 
 
-def test_two_videos_are_looked_at(tmp_path: Path) -> None:
-    for side, shift in (("right", -DISPARITY), ("left", 0)):
-        write_video(tmp_path / f"{side}.avi", [texture(number, shift) for number in range(3)])
-    found = check_folder(tmp_path)
-    assert any("disparity" in each.what for each in found)
-    eyes = f"source.left:={tmp_path / 'left.avi'} source.right:={tmp_path / 'right.avi'}"
-    assert eyes in found[-1].what
-
-
-def test_what_is_recognised_is_played(tmp_path: Path) -> None:
-    """Also from a folder whose name YAML would read as something else."""
-    folder = made(tmp_path / "case: 3 #1")
+@pytest.mark.parametrize("name", ["case: 3 #1", "recorded today"])
+def test_what_is_recognised_is_played(name: str, folder: Path, tmp_path: Path) -> None:
+    """Also from a folder whose name YAML would read as something else, and by the shell's command."""
+    folder = folder.rename(tmp_path / name)
     config = load_launch(folder, overrides_of(folder))
     assert config.source.model_dump(include={"kind", "left", "right", "tools"}) == {
-        "kind": "folders",
-        "left": folder / "left",
-        "right": folder / "right",
-        "tools": folder / "masks",
-    }
+        "kind": "folders", "left": folder / "left", "right": folder / "right", "tools": folder / "masks"
+    }  # fmt: skip
     assert config.rig is None
-    assert overrides_of(SESSION) == []  # it has a launch file
-    for nothing, said in ((tmp_path / "gone", "does not exist"), (tmp_path, "nothing that is known")):
-        with pytest.raises(UsageError, match=said):
-            overrides_of(nothing)
+    said = check_folder(folder)[-1].what.partition("to play it: ")[2]
+    command, _, launch = said.partition(", which stands for ")
+    assert shlex.split(command) == ["sags", "run", str(folder)]
+    assert shlex.split(launch) == overrides_of(folder)
 
 
-def test_noise_is_no_comb_and_fields_are() -> None:
-    # As much in columns as in rows.
+def test_noise_is_not_interlaced_and_darkness_is_no_border() -> None:
     fine = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH), np.uint8)
-    assert combing(fine) == pytest.approx(combing(np.ascontiguousarray(fine.T)), rel=0.1)
-    alternating = np.zeros((10, 10), np.uint8)
-    alternating[1::2] = 100
-    assert combing(alternating) == 1.0 and combing(np.ascontiguousarray(alternating.T)) == 0.0
-
-
-def test_a_dark_picture_has_no_borders() -> None:
+    assert combing(fine) == pytest.approx(combing(np.ascontiguousarray(fine.T)), rel=0.1)  # alike both ways
     assert lit_box(np.zeros((HEIGHT, WIDTH), np.uint8)) == (0, 0, WIDTH, HEIGHT)
 
 
@@ -458,6 +405,7 @@ def test_a_session_is_checked_with_its_calibration() -> None:
     said = "\n".join(each.what for each in found)
     assert "40 frames of 320x256 px at 10 Hz" in said and "calibration: " in said
     assert found[-1].what == f"to play it: sags run {SESSION}"
+    assert overrides_of(SESSION) == []  # it has a launch file
 
 
 def test_a_camera_that_looks_farther_is_asked_how_far(tmp_path: Path) -> None:
@@ -474,34 +422,22 @@ def test_a_camera_that_looks_farther_is_asked_how_far(tmp_path: Path) -> None:
 
 
 def test_folders_that_are_not_played_yet_are_named(tmp_path: Path) -> None:
-    (tmp_path / "P2").mkdir()
-    for name in ("groundtruth.txt", "StereoCalibration.ini"):
-        (tmp_path / "P2" / name).touch()
-    assert "StereoMIS" in check_folder(tmp_path / "P2")[0].what
+    clip = "d4d/specimen_1/s/clips/Clip_1"
+    for name in ("P2", "P3", "stir/01/left01/seq00/segmentation", f"{clip}/left_images_rect"):
+        (tmp_path / name).mkdir(parents=True)
+    for name in ("P2/groundtruth.txt", "P2/StereoCalibration.ini", "P3/track_pts.pckl"):
+        (tmp_path / name).touch()
+    of_d4d = ("d4d", "d4d/specimen_1", "d4d/specimen_1/s", clip)
+    named = {"P2": "StereoMIS", "P3": "StereoMIS-Tracking", "stir": "STIR", **dict.fromkeys(of_d4d, "D4D")}
+    for name, said in named.items():
+        assert said in check_folder(tmp_path / name)[0].what
     assert f"stereomis {tmp_path / 'P2'} measures it" in check_folder(tmp_path / "P2")[0].fix
-    (tmp_path / "stir/01/left01/seq00/segmentation").mkdir(parents=True)
-    assert "STIR" in check_folder(tmp_path / "stir")[0].what
-    (tmp_path / "d4d/specimen_1/s/clips/Clip_1/left_images_rect").mkdir(parents=True)
-    for name in ("d4d", "d4d/specimen_1", "d4d/specimen_1/s", "d4d/specimen_1/s/clips/Clip_1"):
-        assert "D4D" in check_folder(tmp_path / name)[0].what
-    (tmp_path / "P3").mkdir()
-    (tmp_path / "P3/track_pts.pckl").touch()
-    assert "StereoMIS-Tracking" in check_folder(tmp_path / "P3")[0].what
     (unknown,) = check_folder(tmp_path)
     assert unknown.level == "error" and "nothing that is known" in unknown.what
     assert "P2, P3, d4d, stir" in unknown.fix
 
 
-def test_the_command_that_plays_a_folder_with_spaces_is_one_for_a_shell(tmp_path: Path) -> None:
-    folder = made(tmp_path / "recorded today")
-    said = check_folder(folder)[-1].what.partition("to play it: ")[2]
-    command, _, launch = said.partition(", which stands for ")
-    assert shlex.split(command) == ["sags", "run", str(folder)]
-    assert shlex.split(launch) == overrides_of(folder)
-
-
-def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = made(tmp_path / "case")
+def test_the_command(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = figures_of("import", "--check", folder, "--json")
     assert found[0]["what"] == "case is two folders of images"
     monkeypatch.setattr(terminal, "SAY_EVERY", 0.0)
@@ -550,26 +486,25 @@ def test_videos_that_cannot_be_played_are_refused(
 
 
 @pytest.mark.fault("file: a video is cut off")
-@pytest.mark.parametrize("shown", ["both eyes", "left", "right"])
 @pytest.mark.parametrize(
-    ("suffix", "how"),
+    ("shown", "suffix", "how"),
     [
-        ("mp4", {"muxer": {"movflags": "faststart"}}),
-        ("mkv", {}),
-        ("ts", {}),
-        ("avi", {"codec": "mjpeg", "pixels": "yuvj420p"}),
+        ("both eyes", "mp4", {"muxer": {"movflags": "faststart"}}),
+        ("left", "mp4", {"muxer": {"movflags": "faststart"}}),
+        ("right", "mkv", {}),
+        ("left", "ts", {}),
+        ("both eyes", "ts", {}),
+        ("right", "avi", {"codec": "mjpeg", "pixels": "yuvj420p"}),
     ],
 )
-def test_a_video_that_is_cut_off_is_refused_by_check_and_run_alike(
-    suffix: str, how: dict[str, object], shown: str, tmp_path: Path
-) -> None:
+def test_a_video_that_is_cut_off_is_refused_alike(shown: str, suffix: str, how: Any, tmp_path: Path) -> None:
     """As any damaged file; what is there can be played."""
     pictures = [[cv2.resize(each, (256, 160)) for each in moving(150, shift)] for shift in (0, -DISPARITY)]
     named = dict(zip(("left", "right"), pictures, strict=True))
     if shown == "both eyes":
         named = {shown: [np.hstack(pair) for pair in zip(*pictures, strict=True)]}
     for name, each in named.items():
-        write(tmp_path / f"{name}.{suffix}", each, options={"g": "10"}, **how)  # type: ignore[arg-type]
+        write(tmp_path / f"{name}.{suffix}", each, options={"g": "10"}, **how)
     file = tmp_path / f"{shown}.{suffix}"
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2 | 1])
     (error,) = [each for each in check_folder(tmp_path) if each.level == "error"]
@@ -590,21 +525,17 @@ def test_an_eye_that_is_late_is_found(tmp_path: Path, late: int, how: str) -> No
     """The right eye shows at frame t what the left one shows at t - late."""
     left, right = moving(60), moving(60, -DISPARITY)
     left, right = left[max(0, late) : 50 + min(0, late)], right[max(0, -late) : 50 - max(0, late)]
+    folder = tmp_path / "case"
     if how == "videos":
-        folder = write_eyes(tmp_path / "case", left, right)
-    else:
-        folder = tmp_path / "case"
-        for side, pictures in (("left", left), ("right", right)):
-            (folder / side).mkdir(parents=True)
-            for number, picture in enumerate(pictures):
-                cv2.imwrite(str(folder / side / f"{number:03}.bmp"), picture)
+        write_eyes(folder, left, right)
+    for side, pictures in (("left", left), ("right", right)) if how != "videos" else ():
+        (folder / side).mkdir(parents=True)
+        for number, picture in enumerate(pictures):
+            cv2.imwrite(str(folder / side / f"{number:03}.bmp"), picture)
     if how == "a session":
         (folder / "launch.yaml").write_text("source: {kind: folders, left: left, right: right}\n")
-    said = [each.what for each in check_folder(folder) if "frames late" in each.what]
-    eye = "right" if late > 0 else "left"
-    assert [each.partition(":")[0] for each in said] == [f"the {eye} eye is {abs(late)} frames late"] * (
-        late != 0
-    )
+    said = [each.what.partition(":")[0] for each in check_folder(folder) if "frames late" in each.what]
+    assert said == [f"the {'right' if late > 0 else 'left'} eye is {abs(late)} frames late"] * (late != 0)
 
 
 @pytest.mark.parametrize("late", [0, 14, -14])
@@ -629,14 +560,17 @@ def test_where_nothing_moves_no_eye_is_late(tmp_path: Path) -> None:
     assert "frames late" not in str(found)
 
 
-@pytest.mark.parametrize("what", ["empty", "images of one eye", "a wrong launch file", "text"])
-def test_what_cannot_be_played_has_exit_code_1(tmp_path: Path, what: str) -> None:
-    if what == "images of one eye":
-        cv2.imwrite(str(tmp_path / "a.png"), texture(0))
-    if what == "a wrong launch file":
-        (tmp_path / "launch.yaml").write_text("sorce: {}")
-    if what == "text":
-        (tmp_path / "notes.txt").write_text("mine")
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("folder", None), ("a.png", "one eye"), ("launch.yaml", "sorce: {}"), ("notes.txt", "mine")],
+)
+def test_what_cannot_be_played_has_exit_code_1(tmp_path: Path, name: str, content: str | None) -> None:
+    if content is None:
+        (tmp_path / name).mkdir()
+    elif name == "a.png":
+        cv2.imwrite(str(tmp_path / name), texture(0))
+    else:
+        (tmp_path / name).write_text(content)
     code, out, error = ran("import", "--check", tmp_path)
     assert code == 1 and "cannot be played" in error and "error" in out
 
@@ -652,8 +586,7 @@ def test_a_calibration_beside_videos_is_compared_with_them(tmp_path: Path) -> No
     ["camchain.yaml"], ["ost.yaml"], ["cam0_info.yml"], ["a.yml", "b.xml"],
     ["files/a.xml"], ["stereoParams.mat"], ["StereoCalibration.ini"], ["intrinsics.txt"], ["more/calib.json"],
 ])  # fmt: skip
-def test_a_calibration_that_is_not_used_is_named(names: list[str], tmp_path: Path) -> None:
-    folder = made(tmp_path / "case")
+def test_a_calibration_that_is_not_used_is_named(names: list[str], folder: Path) -> None:
     (folder / "calib_board.png").write_bytes((folder / "masks/000.png").read_bytes())
     for name in names:
         (folder / name).parent.mkdir(exist_ok=True)

@@ -63,38 +63,30 @@ def test_panes_that_are_exchanged_are_put_in_order(tmp_path: Path) -> None:
     assert said["source.geometry.first"] == "left" and "are exchanged" in str(found.findings)
 
 
-def test_black_borders_are_cut_off(tmp_path: Path) -> None:
-    framed = [
-        [cv2.copyMakeBorder(picture, 16, 16, 32, 32, cv2.BORDER_CONSTANT) for picture in eye]
-        for eye in (LEFT, RIGHT)
-    ]
-    launch = propose(videos(tmp_path, *framed)).launch
-    x, y, width, height = yaml.safe_load(set_by(launch)["source.geometry.crop"])
-    assert abs(x - 32) <= 2 and abs(y - 16) <= 2  # compressed: the edge is soft
-    assert abs(width - LEFT[0].shape[1]) <= 4 and abs(height - LEFT[0].shape[0]) <= 4
-
-
-def framed(left: int, right: int, eye: list[U8]) -> list[U8]:
-    """Images with black borders of so many columns, of the same size."""
+def framed(left: int, right: int, eye: list[U8], rows: int = 0) -> list[U8]:
+    """Images with black borders of so many columns and rows, of the same size."""
     pictures = [picture.copy() for picture in eye]
     for picture in pictures:
         picture[:, :left] = picture[:, picture.shape[1] - right :] = 0
+        picture[:rows] = picture[picture.shape[0] - rows :] = 0
     return pictures
 
 
-def test_borders_that_differ_between_the_eyes_give_one_crop(tmp_path: Path) -> None:
-    both = videos(tmp_path, framed(16, 0, LEFT), framed(0, 24, RIGHT))
-    found = propose(both)
-    x, _, width, _ = yaml.safe_load(set_by(found.launch)["source.geometry.crop"])
-    assert abs(x - 16) <= 2 and abs(x + width - (320 - 24)) <= 2
+@pytest.mark.parametrize("left", [(32, 32), (16, 0)], ids=["alike", "the eyes' differ"])
+def test_black_borders_are_cut_off_and_both_eyes_get_one_crop(left: tuple[int, int], tmp_path: Path) -> None:
+    right = left if left[1] else (0, 24)
+    both = framed(*left, LEFT, rows=16), framed(*right, RIGHT, rows=16)
+    found = propose(videos(tmp_path, *both))
+    x, y, width, height = yaml.safe_load(set_by(found.launch)["source.geometry.crop"])
+    assert abs(x - left[0]) <= 2 and abs(y - 16) <= 2  # compressed: the edge is soft
+    assert abs(x + width - (320 - right[1])) <= 2 and abs(height - (256 - 32)) <= 4
     assert not [each for each in found.findings if "borders; the image" in each.what and each.level != "ok"]
 
 
 @pytest.mark.parametrize("flip", ["none", "horizontal", "both"])
 def test_borders_within_a_crop_are_those_of_the_whole_picture(flip: str, tmp_path: Path) -> None:
     both = videos(tmp_path, framed(32, 32, LEFT), framed(32, 32, RIGHT))
-    crop = "source.geometry.crop:=[20,10,290,240]"
-    found = propose(both, [crop, f"source.geometry.flip:={flip}"])
+    found = propose(both, ["source.geometry.crop:=[20,10,290,240]", f"source.geometry.flip:={flip}"])
     x, y, width, height = yaml.safe_load(set_by(found.launch)["source.geometry.crop"])
     assert abs(x - 32) <= 2 and abs(x + width - (320 - 32)) <= 2 and (y, height) == (10, 240)
 
@@ -151,9 +143,7 @@ def test_what_cannot_be_played_gets_no_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["data$", "a $SAGS_DATA b", "${HOME}", "$$", "a\tb", "videos", "bag"])
-def test_a_path_is_a_path_and_a_word_a_word(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_paths_are_paths_and_words_words(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Names with a dollar or a tab, and folders that are called as values of keys are."""
     left, right = videos(tmp_path / name, LEFT, RIGHT)
     monkeypatch.chdir(tmp_path)
