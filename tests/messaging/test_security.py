@@ -509,7 +509,6 @@ SUBSCRIPTIONS = b"".join(b"\x00\xc9\x01" + np.random.default_rng(i).bytes(200) f
 SMALL_ONES = b"".join(bytes((0, len(said))) + said for said in (
     *(b"\x01junk/%d" % i for i in range(10_000)), b"\x01\xff\xfe", b"\x05sags/tf",
 ))  # fmt: skip
-TEN_THOUSAND = pytest.mark.fault("socket: ten thousand subscriptions")
 ENDLESS = b"".join(b"\x01\xc9" + bytes(201) for _ in range(2000))  # each part says: more to come
 
 
@@ -518,7 +517,13 @@ ENDLESS = b"".join(b"\x01\xc9" + bytes(201) for _ in range(2000))  # each part s
     ("which", "kind", "block"),
     [
         pytest.param("data", b"SUB", SUBSCRIPTIONS, id="subscriptions"),
-        pytest.param("data", b"SUB", SMALL_ONES, marks=TEN_THOUSAND, id="ten thousand small subscriptions"),
+        pytest.param(
+            "data",
+            b"SUB",
+            SMALL_ONES,
+            id="ten thousand subscriptions",
+            marks=pytest.mark.fault("socket: ten thousand subscriptions"),
+        ),
         pytest.param("control", b"DEALER", ENDLESS, id="an endless message"),
     ],
 )
