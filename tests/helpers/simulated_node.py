@@ -106,14 +106,8 @@ class Socket:
 class Network:
     """The names of `zmq` that the publisher uses."""
 
-    XPUB, ROUTER, POLLIN, NOBLOCK, XPUB_VERBOSE = (
-        zmq.XPUB,
-        zmq.ROUTER,
-        zmq.POLLIN,
-        zmq.NOBLOCK,
-        zmq.XPUB_VERBOSE,
-    )
-    Again, ZMQError = zmq.Again, zmq.ZMQError
+    XPUB, ROUTER, XPUB_VERBOSE = zmq.XPUB, zmq.ROUTER, zmq.XPUB_VERBOSE
+    POLLIN, NOBLOCK, Again, ZMQError = zmq.POLLIN, zmq.NOBLOCK, zmq.Again, zmq.ZMQError
 
     def __init__(self, world: World, wake: EventFd) -> None:
         self._world, self._wake = world, wake

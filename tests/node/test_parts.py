@@ -31,7 +31,7 @@ from sags_node.pipeline.session import open_session
 from sags_node.types import FrameResult, Gaussians, NodeHealth, RungState
 
 
-def test_newest_wins_and_the_replaced_are_counted() -> None:
+def test_the_newest_is_kept_also_at_the_end_and_the_replaced_are_counted() -> None:
     """Of each, and of the end, one is told that asks for it."""
     calls = []
     slot: Latest[int] = Latest(on_put=lambda: calls.append(1))
@@ -39,18 +39,10 @@ def test_newest_wins_and_the_replaced_are_counted() -> None:
         slot.put(value)
     assert slot.get() == 3 and slot.dropped == 2 and len(calls) == 3
     assert slot.get(timeout=0.01) is None
-    slot.close()
-    assert len(calls) == 4
-
-
-def test_close_delivers_what_is_left_then_ends() -> None:
-    slot: Latest[int] = Latest()
     slot.put(7)
     slot.close()
-    assert not slot.closed
-    assert slot.get() == 7
-    assert slot.closed
-    assert slot.get() is None
+    assert len(calls) == 5 and not slot.closed
+    assert slot.get() == 7 and slot.closed and slot.get() is None
 
 
 def test_close_wakes_a_waiter() -> None:
@@ -151,13 +143,10 @@ def test_a_node_that_takes_no_frame_in_is_not_well(monkeypatch: pytest.MonkeyPat
     ("consumers", "rung", "said"),
     [
         (0, 3, "end other programs, or lower mapping.max_gaussians or vision.scale"),
-        (
-            2,
-            0,
-            "2 consumers take messages: end some, or let them subscribe to thin/ topics; end other programs",
-        ),
+        (2, 0, "2 consumers take messages: end some, or let them subscribe to thin/ topics; "
+               "end other programs"),
     ],
-)
+)  # fmt: skip
 def test_frames_that_are_missed_are_blamed_on_who_takes_part(consumers: int, rung: int, said: str) -> None:
     """On the lowest rung nothing is left to lower."""
     statistics = Statistics(FoldersSource(left=Path("left"), right=Path("right")))
@@ -180,21 +169,15 @@ def test_a_node_that_shows_nothing_is_not_well(
     skipped: dict[str, str], tissue: bool, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     node, seen, view = Node(monkeypatch), TAKEN_IN.observation, TAKEN_IN.views["left"]
-    blank = replace(
-        TAKEN_IN,
-        views={"left": replace(view, alpha=np.zeros_like(view.alpha))},
-        observation=replace(seen, tissue=seen.tissue & tissue),
-        skipped=skipped,
-    )
+    views = {"left": replace(view, alpha=np.zeros_like(view.alpha))}
+    observation = replace(seen, tissue=seen.tissue & tissue)
+    blank = replace(TAKEN_IN, views=views, observation=observation, skipped=skipped)
     for before in (0.0, 3.0):  # from the start, and later
         node.publish(before)
         assert content.health_answer(node.publish(0.9, result=blank))["healthy"]
         health = node.publish(0.3, result=blank)
-        assert content.health_answer(health) == {
-            "healthy": False,
-            "state": "running",
-            "warnings": ["no_model"],
-        }
+        told = {"healthy": False, "state": "running", "warnings": ["no_model"]}
+        assert content.health_answer(health) == told
         assert said in by_code(health.warnings)["no_model"]
     assert content.health_answer(node.publish(PERIOD))["healthy"]
 
@@ -209,10 +192,9 @@ def test_the_latency_is_told_while_the_health_is_being_counted(monkeypatch: pyte
 
     def resident_mb() -> float:
         counting.set()
-        assert goes_on.wait(60)
-        return 0.0
+        return float(goes_on.wait(60))
 
-    monkeypatch.setattr("sags_node.node.health.resident_mb", resident_mb)
+    monkeypatch.setattr(health_module, "resident_mb", resident_mb)
     with ThreadPoolExecutor(2) as others:
         others.submit(statistics.health, {}, False, False, None, {}, {}, {})
         try:
@@ -272,7 +254,11 @@ def test_a_model_without_a_calibration_says_so_and_is_nowhere_sure(tmp_path: Pat
 
 
 @pytest.mark.fault("file: a model is to be saved under a name that nobody can write, or nobody can be told")
-def test_a_name_that_cannot_be_is_refused_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_model_that_cannot_be_saved_is_refused_in_words(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(SagsError, match="no model yet"):
+        operations(None).handlers()["save_model"]({"path": str(tmp_path / "model.ply")})
     save = operations(plane_result()).handlers()["save_model"]
     with pytest.raises(SagsError, match=r"cannot write .*name too long; name another place"):
         save({"path": f"{tmp_path / ('n' * 300)}.ply"}).result(30)
@@ -282,8 +268,3 @@ def test_a_name_that_cannot_be_is_refused_in_words(tmp_path: Path, monkeypatch: 
     with pytest.raises(SagsError, match=r"no UTF-8 text.*rename it") as refused:
         save({"path": "model.ply"})
     str(refused.value).encode()  # it can be sent
-
-
-def test_before_the_first_frame_there_is_nothing_to_save(tmp_path: Path) -> None:
-    with pytest.raises(SagsError, match="no model yet"):
-        operations(None).handlers()["save_model"]({"path": str(tmp_path / "model.ply")})

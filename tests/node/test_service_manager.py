@@ -83,7 +83,7 @@ def test_a_ping_needs_all_loops_and_is_sent_seldom(manager: Manager, monkeypatch
     assert manager.listen(0.05) == []
 
 
-def test_nothing_is_sent_where_nobody_asked(manager: Manager) -> None:
+def test_nothing_is_sent_where_nobody_asked_or_listens(manager: Manager) -> None:
     alone = ServiceManager({})
     other = manager.environment(pid=os.getpid() + 1)
     for told in (alone, ServiceManager(other)):  # the watchdog of another process
@@ -92,9 +92,6 @@ def test_nothing_is_sent_where_nobody_asked(manager: Manager) -> None:
     alone.ready()
     assert manager.listen(0.05) == []
     assert not other, "children would believe that it is for them"
-
-
-def test_a_manager_that_has_gone_ends_nothing(manager: Manager) -> None:
     told = ServiceManager(manager.environment())
     manager.close()
     told.ready()

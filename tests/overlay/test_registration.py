@@ -1,7 +1,7 @@
 """A model placed on tissue by pairs of points and its surface: how exactly, what is told, what is refused."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -11,21 +11,17 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from bridging import SEEN, anchored, sockets
-from command_line import figures_at_last, refused
-from running_node import RunningNode
+from bridging import SEEN, anchored, anchored_at, sockets
+from command_line import refused
 from synthetic import at_frame, stream
-from test_overlay import overlay
 from waiting import until
 
 from sags_node.clients.overlay.registering import frames_of
-from sags_node.clients.overlay.scene import read_scene
 from sags_node.clients.registration.register import Registration, register
-from sags_node.clients.registration.rigid import kabsch, nine_of_ten, of_pairs, picking_error, rigid_fit
+from sags_node.clients.registration.rigid import kabsch, nine_of_ten, of_pairs, picking_error
 from sags_node.clients.registration.surfaces import MIRROR, Shape, Surface
 from sags_node.geometry import project, transform
 from sags_node.messaging.address import NodeAddress
-from sags_node.phantom import write_session
 from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.types import F64, I32, AnchorsAhead, Camera
 
@@ -123,9 +119,15 @@ def picked(organ: Organ, seed: int) -> F64:
     return organ.picks + np.random.default_rng(seed).normal(0, 1e-3, organ.picks.shape)
 
 
+def fitted(organ: Organ, **changed: Any) -> Registration:
+    """From what is true of the organ but for what is changed."""
+    given: dict[str, Any] = {"model": organ.model, "at": organ.at, "places": organ.picks}
+    return register(**given | {"surface": organ.surface, "targets": organ.targets} | changed)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_the_surface_makes_it_better_than_the_pairs_and_no_worse_than_told(organ: Organ, seed: int) -> None:
-    found = register(organ.model, organ.at, picked(organ, seed), organ.surface, organ.targets)
+    found = fitted(organ, places=picked(organ, seed))
     assert found.verdict == "good" and found.expected is not None and found.expected_by_pairs is not None
     assert (organ.off(found) < found.expected).all() and (found.expected < found.expected_by_pairs).all()
     assert np.median(organ.off(found)) < 1.5e-3
@@ -134,10 +136,11 @@ def test_the_surface_makes_it_better_than_the_pairs_and_no_worse_than_told(organ
 
 def test_what_lies_over_a_part_of_it_does_not_pull(organ: Organ) -> None:
     """A fifth of the image shows something 6 mm nearer, all over the model's middle."""
-    clean = register(organ.model, organ.at, picked(organ, 0), organ.surface, organ.targets)
     depth = organ.depth.copy()
     depth[100:160, 110:200] -= 0.006
-    found = register(organ.model, organ.at, picked(organ, 0), organ.seen(depth), organ.targets)
+    clean, found = (
+        fitted(organ, places=picked(organ, 0), surface=organ.seen(d)) for d in (organ.depth, depth)
+    )
     assert np.abs(organ.off(found) - organ.off(clean)).max() < 0.5e-3
     assert found.share < 0.9
 
@@ -154,14 +157,15 @@ def test_what_lies_over_a_part_of_it_does_not_pull(organ: Organ) -> None:
 )  # fmt: skip
 def test_a_wrong_unit_is_refused(organ: Organ, factor: float, said: str) -> None:
     model = Shape(factor * organ.vertices, organ.triangles)
-    found = register(model, factor * organ.at, organ.picks, organ.surface, factor * organ.targets)
+    found = fitted(organ, model=model, at=factor * organ.at, targets=factor * organ.targets)
     assert found.verdict == "refused" and said in found.reason
 
 
 @pytest.mark.parametrize("pairs", [3, 5])  # three are as well fitted by their mirror image
 def test_a_mirrored_file_is_refused(organ: Organ, pairs: int) -> None:
     at, places = organ.at[:pairs] * MIRROR, picked(organ, 1)[:pairs]
-    found = register(organ.model.mirrored(), at, places, organ.surface, organ.targets * MIRROR)
+    model, targets = organ.model.mirrored(), organ.targets * MIRROR
+    found = fitted(organ, model=model, at=at, places=places, targets=targets)
     assert found.verdict == "refused" and "handedness" in found.reason
 
 
@@ -178,35 +182,35 @@ def test_points_in_other_axes_or_another_unit_than_the_file_are_refused(
 ) -> None:
     """Wherever the file has its origin, with picks that are 1 mm wrong."""
     away = np.array([moved, -moved, 2 * moved]) - organ.vertices.mean(0)
-    model = Shape(organ.vertices + away, organ.triangles)
+    changed = {"model": Shape(organ.vertices + away, organ.triangles), "targets": organ.targets + away}
     at = organ.at + away + np.random.default_rng(3).normal(0, 3e-4, organ.at.shape)
-    found = register(model, at * factors, organ.picks, organ.surface, organ.targets + away)
+    found = fitted(organ, at=at * factors, **changed)
     assert found.verdict == "refused" and f"as {said}" in found.reason and "mm from the file" in found.reason
-    assert register(model, at, organ.picks, organ.surface, organ.targets + away).verdict == "good"
+    assert fitted(organ, at=at, **changed).verdict == "good"
 
 
-def test_a_point_aside_of_the_model_is_the_reason_if_it_does_not_fit(organ: Organ) -> None:
-    at = organ.at.copy()
-    at[2] += (0.04, 0, 0.03)
-    found = register(organ.model, at, organ.picks, organ.surface, organ.targets)
-    assert found.verdict == "refused" and "mm from the model: are these points of this file" in found.reason
+def on_a_line(points: F64) -> F64:
+    return np.asarray(points[0] + np.linspace(0, 1, 4)[:, None] * (points[1] - points[0]))
 
 
-def test_too_few_points_and_those_on_a_line_are_refused(organ: Organ) -> None:
-    few = register(organ.model, organ.at[:2], organ.picks[:2], organ.surface, organ.targets)
-    assert few.verdict == "refused" and "2 pairs: give 3 to 20" in few.reason
-    line = np.linspace(0, 1, 4)[:, None]
-    ends = [points[0] + line * (points[1] - points[0]) for points in (organ.at, organ.picks)]
-    found = register(organ.model, *ends, organ.surface, organ.targets)
-    assert found.verdict == "refused" and "lie on a line" in found.reason
-
-
-def test_what_is_out_of_sight_and_pairs_that_do_not_fit_are_refused(organ: Organ) -> None:
-    aside = organ.picks + np.array([0.3, 0, 0])
-    assert "in sight" in register(organ.model, organ.at, aside, organ.surface, organ.targets).reason
-    exchanged = organ.picks[[1, 0, 2, 3, 4]]
-    found = register(organ.model, organ.at, exchanged, organ.surface, organ.targets)
-    assert found.verdict == "refused" and "fit each other to" in found.reason
+@pytest.mark.parametrize(
+    ("at", "places", "said"),
+    [
+        pytest.param(lambda at: at[:2], lambda at: at[:2], "2 pairs: give 3 to 20", id="two pairs"),
+        pytest.param(on_a_line, on_a_line, "lie on a line", id="pairs on a line"),
+        pytest.param(np.copy, lambda at: np.add(at, [0.3, 0, 0]), "in sight", id="beside what is seen"),
+        pytest.param(np.copy, lambda at: at[[1, 0, 2, 3, 4]], "fit each other to", id="two exchanged"),
+        pytest.param(
+            lambda at: at + np.eye(5)[:, 2:3] * (0.04, 0, 0.03), np.copy,
+            "mm from the model: are these points of this file", id="one beside the model",
+        ),
+    ],
+)  # fmt: skip
+def test_what_is_out_of_sight_and_pairs_that_do_not_fit_are_refused(
+    organ: Organ, at: Callable[[F64], F64], places: Callable[[F64], F64], said: str
+) -> None:
+    found = fitted(organ, at=at(organ.at), places=places(organ.picks))
+    assert found.verdict == "refused" and said in found.reason
 
 
 @pytest.mark.parametrize("shape", ["plane", "ball", "tube"])
@@ -230,65 +234,17 @@ def test_an_even_shape_is_refused(shape: str) -> None:
 # ---- the command, beside a node --------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningNode]:
-    folder = tmp_path_factory.mktemp("still")
-    write_session(SCENE, folder / "session", rate=5.0)
-    running = RunningNode(folder / "session", folder, "mapping.iterations:=1")  # the same on a busy machine
-    yield running
-    running.stop()
-
-
-@pytest.fixture
-def files(organ: Organ, tmp_path: Path) -> Path:
-    return written(organ, tmp_path)
-
-
 def written(organ: Organ, folder: Path) -> Path:
     """The organ in mm, and its pairs, in a folder."""
     import open3d as o3d
 
-    mesh = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(1e3 * organ.vertices), o3d.utility.Vector3iVector(organ.triangles)
-    )
+    vertices, triangles = o3d.utility.Vector3dVector(1e3 * organ.vertices), organ.triangles
+    mesh = o3d.geometry.TriangleMesh(vertices, o3d.utility.Vector3iVector(triangles))
     assert o3d.io.write_triangle_mesh(str(folder / "organ.ply"), mesh)
-    pairs = [
-        {"pixel": pixel, "at": (1e3 * at).tolist()}
-        for pixel, at in zip(PICKS.tolist(), organ.at, strict=True)
-    ]
-    targets = (1e3 * organ.targets).tolist()
+    at, targets = ((1e3 * points).tolist() for points in (organ.at, organ.targets))
+    pairs = [{"pixel": pixel, "at": each} for pixel, each in zip(PICKS.tolist(), at, strict=True)]
     (folder / "pairs.yaml").write_text(yaml.safe_dump({"pairs": pairs, "targets": targets}))
     return folder
-
-
-@pytest.mark.live
-def test_the_command_writes_a_scene_that_plays(node: RunningNode, organ: Organ, files: Path) -> None:
-    scene = files / "scene.yaml"
-    given = (files / "organ.ply", "--points", files / "pairs.yaml", "-o", scene, "--run-dir", node.run_dir)
-    said = figures_at_last("register", *given, "--json")
-    thing = read_scene(scene).objects[0]
-    kept = thing.registration and thing.registration.model_dump()
-    assert kept == {key: said[key] for key in said if key != "scene"}
-    assert said["verdict"] == "good" and said["share"] > 0.8 and said["session"] and said["epoch"] >= 0
-    places, at = (np.array([getattr(anchor, key) for anchor in thing.anchors]) for key in ("place", "at"))
-    T, misfit = rigid_fit(thing.scale * at, places, np.ones(len(at)))
-    off = np.linalg.norm(transform(T, organ.targets) - DEEP * organ.picks, axis=1)
-    assert misfit < 1e-6 and (1e3 * off <= [target["expected_mm"] for target in said["targets"]]).all()
-    assert np.allclose(T @ AWAY, np.eye(4), atol=0.05)
-    written = yaml.safe_load(scene.read_text())
-    written["objects"] += [written["objects"][0] | {"deform": True}]
-    scene.write_text(yaml.safe_dump(written))
-    with overlay(node.run_dir, scene=scene) as (_, watcher):
-
-        def held() -> Any:
-            objects = watcher.status().get("objects", [{}])
-            checked = all(each.get("sure") and each["residual_mm"] is not None for each in objects)
-            return checked and objects[1]["deform"]["pulling"] > 20 and objects
-
-        for each in until(held):
-            assert each["residual_mm"] <= each["residual_limit_mm"], each
-        watcher.pictures(1, drawn=True)
-    refused(2, "register", *given, said=(str(scene), "exists already", "--force"))
 
 
 @pytest.mark.live
@@ -316,26 +272,29 @@ def test_frames_of_before_a_gap_are_not_used_with_those_after_it(tmp_path: Path)
     assert stamps[-1] - stamps[0] > 0.89 * seconds
 
 
+POINT = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+
+
 @pytest.mark.live
-def test_what_the_command_refuses(node: RunningNode, organ: Organ, files: Path) -> None:
+def test_what_the_command_refuses(organ: Organ, tmp_path: Path) -> None:
+    files = written(organ, tmp_path)
     pairs = yaml.safe_load((files / "pairs.yaml").read_text())
 
     def says(code: int, changed: dict[str, Any], *more: object, said: tuple[str, ...]) -> None:
         (files / "pairs.yaml").write_text(yaml.safe_dump(pairs | changed))
-        given = ("--points", files / "pairs.yaml", "-o", files / "out.yaml", "--run-dir", node.run_dir)
+        given = ("--points", files / "pairs.yaml", "-o", files / "out.yaml", "--run-dir", tmp_path)
         refused(code, "register", files / "organ.ply", *given, *more, said=said)
         assert not (files / "out.yaml").exists()
 
     def first(**changed: Any) -> dict[str, Any]:
         return {"pairs": [{"at": pairs["pairs"][0]["at"]} | changed, *pairs["pairs"][1:]]}
 
-    says(2, first(pixel=[900, 3]), said=("pair 1", "outside the image of 320x256"))
-    never = 10**9  # overlays beside it pin some with each turn of the recording
-    says(1, first(anchor=never), said=(f"pair 1: there is no anchor {never}; the node has ",))
-    says(2, first(), said=("pairs.yaml: pairs.0", "either pixel: [u, v] or anchor: NUMBER"))
-    says(2, {"pears": 3}, said=("unknown key 'pears'", "did you mean 'pairs'?"))
-    says(2, {}, "--scale", "1", said=("set scale: 0.001",))
-    says(1, {}, "--ns", "other", said=("no node runs as 'other'",))
-    (files / "organ.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\n"
-                                     "property float y\nproperty float z\nend_header\n0 0 0\n")  # fmt: skip
-    says(2, {}, said=("holds no triangles",))
+    with sockets(tmp_path) as running, stream(running, anchored_at):
+        says(2, first(pixel=[900, 3]), said=("pair 1", "outside the image of 96x64"))
+        says(1, first(anchor=77), said=("pair 1: there is no anchor 77; the node has ",))
+        says(2, first(), said=("pairs.yaml: pairs.0", "either pixel: [u, v] or anchor: NUMBER"))
+        says(2, {"pears": 3}, said=("unknown key 'pears'", "did you mean 'pairs'?"))
+        says(2, {}, "--scale", "1", said=("set scale: 0.001",))
+        says(1, {}, "--ns", "other", said=("no node runs as 'other'",))
+        (files / "organ.ply").write_text(f"{POINT}end_header\n0 0 0\n")
+        says(2, {}, said=("holds no triangles",))

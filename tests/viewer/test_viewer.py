@@ -10,10 +10,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import msgspec
@@ -29,7 +30,7 @@ from sags_node.clients.viewer.feed import CONFIDENCE, DEPTH, LEFT, RIGHT, SHOWN,
 from sags_node.clients.viewer.history import GAP, History
 from sags_node.clients.viewer.overlay import Overlay, Thing
 from sags_node.clients.viewer.pictures import BAR, VIEWS, Sheet, needs_of
-from sags_node.clients.viewer.splats import Splats, splats_of
+from sags_node.clients.viewer.splats import splats_of
 from sags_node.clients.viewer.still import SILENT_AFTER
 from sags_node.config.schema import PhantomSource
 from sags_node.messaging.address import THE_NODE
@@ -49,53 +50,36 @@ KEEP_ERRORS = """
 """
 SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
-LOAD_VISER = [sys.executable, "-c", "import viser"]
-needs_viser = pytest.mark.skipif(
-    subprocess.run(LOAD_VISER, capture_output=True, check=False, timeout=300).returncode != 0,
-    reason="viser is not installed (extra: viewer)",
-)
+
+@pytest.fixture(scope="module")
+def viser() -> None:
+    pytest.importorskip("viser", reason="viser is not installed (extra: viewer)")
+
+
+class Served(NamedTuple):
+    """The viewer's page without a node."""
+
+    server: Any
+    panel: Any
+    scene: Any
+    url: str
+
+
+@pytest.fixture
+def served(viser: None) -> Iterator[Served]:
+    from sags_node.clients.viewer.panel import Panel
+    from sags_node.clients.viewer.scene import Scene
+    from sags_node.clients.viewer.server import serving
+
+    def export(gaussians: Gaussians, camera: Camera, t_capture_ns: int, kind: str) -> bytes:
+        return f"{kind} of {len(gaussians)} at {t_capture_ns}".encode()
+
+    with serving("127.0.0.1", 0, False) as (server, url):
+        scene = Scene(server)
+        yield Served(server, Panel(server, scene, THE_NODE, export, 20.0), scene, url)
 
 
 # ---- what a click meets ----------------------------------------------------------------------------------
-
-
-def sheet_of_splats(z: float, opacity: float, tilt: float = 0.0) -> Splats:
-    """A flat square of 41 x 41 splats, 20 mm wide, its middle at (0, 0, z) m, turned about y."""
-    side = np.linspace(-0.01, 0.01, 41, dtype=np.float32)
-    flat = np.stack([*np.meshgrid(side, side), np.zeros((41, 41), np.float32)], -1).reshape(-1, 3)
-    turn = np.array(
-        [[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]], np.float32
-    )
-    means = flat @ turn.T + np.array([0, 0, z], np.float32)
-    count = len(means)
-    return Splats(
-        means=means,
-        rotations=np.broadcast_to(turn, (count, 3, 3)),
-        scales=np.broadcast_to(np.array([4e-4, 4e-4, 2e-5], np.float32), (count, 3)),
-        colors=np.full((count, 3), 0.5, np.float32),
-        opacities=np.full(count, opacity, np.float32),
-    )
-
-
-def both(first: Splats, second: Splats) -> Splats:
-    names = Splats.__dataclass_fields__
-    return Splats(**{name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names})
-
-
-def test_a_ray_meets_the_nearest_opaque_surface() -> None:
-    front, behind, veil = (
-        sheet_of_splats(0.08, 0.9, tilt=0.6),
-        sheet_of_splats(0.1, 0.9),
-        sheet_of_splats(0.05, 0.05),
-    )
-    tissue = both(both(behind, front), veil)
-    eye = np.array([0.004, -0.002, -0.01])
-    for target in ([0.0, 0.0, 0.08], [0.003, 0.004, 0.08 - 0.003 * np.tan(0.6)]):
-        met = tissue.hit(eye, 7 * (np.array(target) - eye))
-        assert met is not None and np.linalg.norm(met - target) < 2e-4
-    assert veil.hit(eye, np.array([0.0, 0.0, 1.0])) is None, "that is clearer than opaque"
-    assert tissue.hit(eye, np.array([0.0, 0.0, -1.0])) is None, "behind the eye"
-    assert tissue.hit(eye, np.array([1.0, 0.0, 0.3])) is None, "beside the tissue"
 
 
 def rows_of(count: int, **columns: Any) -> Any:
@@ -103,6 +87,27 @@ def rows_of(count: int, **columns: Any) -> Any:
     for name, values in columns.items():
         rows[name] = values
     return rows
+
+
+def square(z: float, opacity: float, tilt: float = 0.0) -> Any:
+    """Rows of 41 x 41 flat splats, 20 mm wide, their middle at (0, 0, z) m, turned about y."""
+    side = np.linspace(-0.01, 0.01, 41)
+    across, down = (each.ravel() for each in np.meshgrid(side, side))
+    place = {"x": across * np.cos(tilt), "y": down, "z": z - across * np.sin(tilt)}
+    shape = {"scale_0": 4e-4, "scale_1": 4e-4, "scale_2": 2e-5, "opacity": opacity}
+    return rows_of(across.size, **place, **shape, rot_w=np.cos(tilt / 2), rot_y=np.sin(tilt / 2))
+
+
+def test_a_ray_meets_the_nearest_opaque_surface() -> None:
+    front, behind, veil = square(0.08, 0.9, tilt=0.6), square(0.1, 0.9), square(0.05, 0.05)
+    tissue = splats_of(np.concatenate([behind, front, veil]))
+    eye = np.array([0.004, -0.002, -0.01])
+    for target in ([0.0, 0.0, 0.08], [0.003, 0.004, 0.08 - 0.003 * np.tan(0.6)]):
+        met = tissue.hit(eye, 7 * (np.array(target) - eye))
+        assert met is not None and np.linalg.norm(met - target) < 2e-4
+    assert splats_of(veil).hit(eye, np.array([0.0, 0.0, 1.0])) is None, "that is clearer than opaque"
+    assert tissue.hit(eye, np.array([0.0, 0.0, -1.0])) is None, "behind the eye"
+    assert tissue.hit(eye, np.array([1.0, 0.0, 0.3])) is None, "beside the tissue"
 
 
 def test_splats_keep_shape_and_colour(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -116,16 +121,14 @@ def test_splats_keep_shape_and_colour(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(splats.colors, [[1.0, 0.25, 0.5]], atol=1e-6)
     monkeypatch.setattr(viewer_splats, "MAX_SPLATS", 3)
     sizes = np.array([1, 5, 2, 4, 3], np.float32) * 1e-3
-    many = splats_of(
-        rows_of(5, scale_0=sizes, scale_1=sizes, scale_2=1e-5, rot_w=1, opacity=[1, 0.01, 1, 1, 1])
-    )
-    assert sorted(many.scales[:, 0] * 1e3) == pytest.approx([2, 3, 4]), "those that cover most"
+    many = rows_of(5, scale_0=sizes, scale_1=sizes, scale_2=1e-5, rot_w=1, opacity=[1, 0.01, 1, 1, 1])
+    assert sorted(splats_of(many).scales[:, 0] * 1e3) == pytest.approx([2, 3, 4]), "those that cover most"
 
 
 # ---- images and figures --------------------------------------------------------------------------------
 
 
-ALL = next(iter(VIEWS))
+ALL, UNDER_CURSOR = next(iter(VIEWS)), "Depth under the cursor"
 
 
 def moment(level: int = 90) -> Moment:
@@ -163,10 +166,8 @@ def test_the_sheet_shows_what_is_new_and_nothing_else() -> None:
     warm, cold = full[height + 80, 50].astype(int), full[-60, 50].astype(int)
     assert warm[0] > warm[2] and cold[2] > cold[0], "near is warm, and up is up"
     assert (full[height:, half:] == ground[60, 60]).all(), "three images: the fourth place is empty"
-    only_picture = sheet.draw(Moment("no model", pictures={LEFT: moment().pictures[LEFT]}), ALL)
-    assert (only_picture[100, 50] == 90).all() and (
-        only_picture[100, half + 50] == ground[100, half + 50]
-    ).all()
+    alone = sheet.draw(Moment("no model", pictures={LEFT: moment().pictures[LEFT]}), ALL)
+    assert (alone[100, 50] == 90).all() and (alone[100, half + 50] == ground[100, half + 50]).all()
     assert (sheet.draw(Moment("gone"), ALL)[60 : height - 30] == ground[60, 60]).all()
 
 
@@ -183,24 +184,15 @@ def test_both_eyes_stand_side_by_side_and_the_overlay_lies_on_them() -> None:
     assert (both[:BAR, half:] != stereo[:BAR, half:]).any(), "which is said"
 
 
-def test_the_range_of_the_depth_colours_is_that_which_is_asked_for() -> None:
-    sheet = Sheet()
-    sheet.draw(moment(), "Depth under the cursor")
-    assert sheet.shown == pytest.approx((0.05, 0.08))
-    followed = sheet.draw(moment(), "Depth under the cursor")[100, -50]
-    sheet.fixed = (0.01, 0.3)
-    fixed = sheet.draw(moment(), "Depth under the cursor")[100, -50]
-    assert sheet.shown == (0.01, 0.3) and (followed != fixed).any()
-
-
-def test_frames_without_known_depth_leave_the_range_of_the_depth_colours() -> None:
+def test_the_depth_colours_have_the_range_of_known_depths_or_that_which_is_asked_for() -> None:
     sheet, seen = Sheet(), moment()
     for unknown in (np.full((32, 40), np.nan, np.float32), np.zeros((32, 40), np.float32)):
-        blind = replace(seen, pictures={**seen.pictures, DEPTH: unknown})
-        sheet.draw(blind, ALL)
-        sheet.draw(seen, ALL)
-        sheet.draw(blind, ALL)
+        for depth in (unknown, seen.pictures[DEPTH], unknown):
+            sheet.draw(replace(seen, pictures={**seen.pictures, DEPTH: depth}), ALL)
         assert sheet.shown == pytest.approx((0.05, 0.08))
+    followed = sheet.draw(seen, UNDER_CURSOR)[100, -50]
+    sheet.fixed = (0.01, 0.3)
+    assert (sheet.draw(seen, UNDER_CURSOR)[100, -50] != followed).any() and sheet.shown == (0.01, 0.3)
 
 
 @pytest.mark.parametrize("plane", [0.05, 0.08])
@@ -208,7 +200,7 @@ def test_a_range_of_one_depth_has_colours_for_nearer_and_further(plane: float) -
     sheet = Sheet()
     sheet.fixed = (plane, plane)
     with np.errstate(all="raise"):
-        drawn = sheet.draw(moment(), "Depth under the cursor").astype(int)
+        drawn = sheet.draw(moment(), UNDER_CURSOR).astype(int)
     near, far = drawn[100, -50], drawn[-60, -50]
     assert near[0] > near[2] and (far[2] > far[0]) == (plane < 0.08)
 
@@ -223,16 +215,15 @@ def test_the_rim_of_the_overlay_is_of_its_own_colour() -> None:
 
 
 def test_the_depth_under_the_cursor_is_the_drawn_one_and_a_guess_is_said_to_be_one() -> None:
-    view = "Depth under the cursor"
-    assert {DEPTH, CONFIDENCE} <= set(needs_of(view)) and CONFIDENCE not in needs_of(ALL)
-    line = depth_line(moment(), view, BAR + 288, "mm")
+    assert {DEPTH, CONFIDENCE} <= set(needs_of(UNDER_CURSOR)) and CONFIDENCE not in needs_of(ALL)
+    line = depth_line(moment(), UNDER_CURSOR, BAR + 288, "mm")
     told = dict(re.findall(r'data-(\w+)="([^"]*)"', line))
     steps = np.frombuffer(base64.b64decode(told["depths"]), "<u2").reshape(32, 40)
     assert (told["columns"], told["rows"], told["left"]) == ("2", "1", "11")
     assert (steps[0] == 0).all(), "not known"
     assert (steps[1:16, 20:] == 500).all() and (steps[16:, 20:] == 800).all(), "tenths of mm"
     assert (steps[16:, :20] == 800 + 2**15).all(), "a guess"
-    assert depth_line(Moment("gone"), view, 300, "mm") == ""
+    assert depth_line(Moment("gone"), UNDER_CURSOR, 300, "mm") == ""
 
 
 def test_figures_grow_by_the_second_and_go_after_a_gap() -> None:
@@ -250,53 +241,56 @@ def test_figures_grow_by_the_second_and_go_after_a_gap() -> None:
     assert history.add(Moment("stale")) and len(history.series("p50")[0]) == 0
 
 
-@needs_viser
-def test_the_distance_of_two_anchors_is_a_guess_unless_both_are_sure() -> None:
-    from sags_node.clients.viewer.panel import distance
+@pytest.mark.usefixtures("viser")
+def test_a_place_and_a_distance_of_anchors_are_a_guess_unless_they_are_sure() -> None:
+    from sags_node.clients.viewer.panel import anchor_table, distance
 
-    def row(x: float, y: float, depth_confidence: float = 0.8) -> dict[str, float]:
-        return {"x": x, "y": y, "z": 0.1, "confidence": 0.9, "depth_confidence": depth_confidence}
-
-    assert distance(row(0, 0), row(0.003, 0.004), "mm") == "Distance: 5.0 mm"
-    assert "5.0 mm, a guess" in distance(row(0, 0), row(0.003, 0.004, 0.4), "mm")
-    assert "lost" in distance(row(0, 0), row(np.nan, np.nan), "mm")
-
-
-@needs_viser
-def test_what_is_chosen_goes_with_the_node_that_numbered_it() -> None:
-    from sags_node.clients.viewer.panel import Panel
-    from sags_node.clients.viewer.scene import Scene
-    from sags_node.clients.viewer.server import serving
-
-    def seen(session: str) -> Moment:
-        return replace(moment(), status=msgspec.structs.replace(moment().status, session=session))
-
-    with serving("127.0.0.1", 0, False) as (server, _):
-        panel = Panel(server, Scene(server), THE_NODE, None, 20.0)
-        panel.show(seen("first"))
-        panel.choose(1)
-        panel.show(Moment("stale", Status(session="first")))
-        assert panel.chosen == 1, "nothing fresh came: it stays"
-        panel.show(Moment("the node is starting", Status(session="second")))
-        assert panel.chosen is None, "number 1 is another anchor now"
+    sure: dict[str, float] = {"id": 3, "x": 0, "y": 0, "z": 0.1, "confidence": 0.9, "depth_confidence": 0.5}
+    sure["visibility"] = 1.0
+    guess, lost = sure | {"depth_confidence": 0.49}, sure | {"x": np.nan, "depth_confidence": 0.0}
+    beside = {"x": 0.003, "y": 0.004}
+    for row, place, apart in (
+        (sure, "0.0 0.0 100.0<", "Distance: 5.0 mm"),
+        (guess, "0.0 0.0 100.0, a guess<", "5.0 mm, a guess"),
+        (lost, "lost<", "lost"),
+    ):
+        table, told = anchor_table([row], "mm"), distance(sure | beside, row, "mm")
+        assert place in table and ("guess" in table) == (row is guess) == ("guess" in told)
+        assert apart in told
 
 
-@needs_viser
-def test_an_anchor_that_was_just_pinned_stays_chosen_until_a_frame_has_it() -> None:
-    from sags_node.clients.viewer.panel import Panel
-    from sags_node.clients.viewer.scene import Scene
-    from sags_node.clients.viewer.server import serving
+@pytest.mark.usefixtures("viser")
+def test_an_anchor_that_is_seen_and_not_sure_in_space_has_a_colour_of_its_own() -> None:
+    from sags_node.clients.viewer.scene import HIDDEN, SEEN, UNSURE, anchor_color
 
-    with serving("127.0.0.1", 0, False) as (server, _):
-        panel = Panel(server, Scene(server), THE_NODE, None, 20.0)
-        panel.show(replace(moment(), anchors=anchors_of(1, 2)))
-        panel.choose(3)
-        panel.show(replace(moment(), anchors=anchors_of(1, 2)))
-        assert panel.chosen == 3, "that frame was captured before"
-        panel.show(replace(moment(), anchors=anchors_of(1, 2, 3)))
-        assert panel.chosen == 3
-        panel.show(replace(moment(), anchors=anchors_of(1, 2)))
-        assert panel.chosen is None, "somebody has removed it"
+    names = ("visibility", "confidence", "depth_confidence")
+    rows = [(1.0, 0.9, 0.9), (0.2, 0.5, 0.5), (1.0, 0.49, 0.9), (1.0, 0.9, 0.49), (0.0, 0.9, 0.9), (0, 0, 0)]
+    colors = [anchor_color(dict(zip(names, row, strict=True))) for row in rows]
+    assert colors == [SEEN, SEEN, UNSURE, UNSURE, HIDDEN, HIDDEN] and len({SEEN, UNSURE, HIDDEN}) == 3
+
+
+def test_what_is_chosen_goes_with_the_node_that_numbered_it(served: Served) -> None:
+    panel = served.panel
+    status = moment().status
+    panel.show(replace(moment(), status=msgspec.structs.replace(status, session="first")))
+    panel.choose(1)
+    panel.show(Moment("stale", Status(session="first")))
+    assert panel.chosen == 1, "nothing fresh came: it stays"
+    panel.show(Moment("the node is starting", Status(session="second")))
+    assert panel.chosen is None, "number 1 is another anchor now"
+
+
+def test_an_anchor_that_was_just_pinned_stays_chosen_until_a_frame_has_it(served: Served) -> None:
+    panel = served.panel
+    without, with_it = (replace(moment(), anchors=anchors_of(*ids)) for ids in ((1, 2), (1, 2, 3)))
+    panel.show(without)
+    panel.choose(3)
+    panel.show(without)
+    assert panel.chosen == 3, "that frame was captured before"
+    panel.show(with_it)
+    assert panel.chosen == 3
+    panel.show(without)
+    assert panel.chosen is None, "somebody has removed it"
 
 
 # ---- the command -----------------------------------------------------------------------------------------
@@ -307,7 +301,7 @@ def test_without_viser_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) 
     refused(2, "view", said=("pip install '.[viewer]'",))
 
 
-@needs_viser
+@pytest.mark.usefixtures("viser")
 def test_other_machines_and_taken_ports_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "nice", lambda increment: 0)  # that is for a process of its own
     refused(2, "view", "--host", "0.0.0.0", said=("without keys", "--insecure", "ssh -L"))
@@ -319,85 +313,62 @@ def test_other_machines_and_taken_ports_are_refused(monkeypatch: pytest.MonkeyPa
     refused(1, "view", "--port", "0", "--endpoint", "nonsense", said=("e.g. tcp://127.0.0.1:5556",))
 
 
-class RunningView:
+class RunningView(NamedTuple):
     """`sags view` in its own process, for nodes of its own run directory."""
 
-    def __init__(self, runtime: Path) -> None:
-        self.runtime = runtime
-        self.process = start(["view", "--port", "0", "--json"], XDG_RUNTIME_DIR=runtime)
-        self.where: dict[str, Any] = json.loads(self.process.stdout.readline())
-
-    def upgrade(self, origin: str) -> int:
-        """HTTP status of the answer to a page of `origin` that asks for the websocket."""
-        lines = (
-            "GET / HTTP/1.1",
-            f"Host: 127.0.0.1:{self.where['port']}",
-            f"Origin: {origin}",
-            "Upgrade: websocket",
-            "Connection: Upgrade",
-            "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==",
-            "Sec-WebSocket-Version: 13",
-            f"Sec-WebSocket-Protocol: viser-v{version('viser')}",  # viser prints of any other
-        )
-        with socket.create_connection(("127.0.0.1", self.where["port"]), timeout=10) as peer:
-            peer.sendall("\r\n".join((*lines, "", "")).encode())
-            return int(peer.recv(100).split()[1])
+    runtime: Path
+    process: subprocess.Popen[str]
+    url: str
+    port: int
 
 
 @pytest.fixture(scope="module")
-def view(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningView]:
-    running = RunningView(tmp_path_factory.mktemp("runtime"))
-    yield running
-    stdout, _ = stopped(running.process)
-    assert running.process.returncode == 0 and stdout == ""
+def view(viser: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningView]:
+    runtime = tmp_path_factory.mktemp("runtime")
+    process = start(["view", "--port", "0", "--json"], XDG_RUNTIME_DIR=runtime)
+    said = json.loads(process.stdout.readline())
+    yield RunningView(runtime, process, said["url"], said["port"])
+    stdout, _ = stopped(process)
+    assert process.returncode == 0 and stdout == ""
 
 
-@needs_viser
 def test_only_its_own_page_may_connect(view: RunningView) -> None:
-    url, port = view.where["url"], view.where["port"]
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    url, port = view.url, view.port
     assert url == f"http://127.0.0.1:{port}"
-    assert view.upgrade(url) == view.upgrade(f"http://localhost:{port}") == 101
+    to_it: Any = {"uri": f"ws://127.0.0.1:{port}", "subprotocols": [f"viser-v{version('viser')}"]}
+    for own in (url, f"http://localhost:{port}"):
+        connect(**to_it, origin=own).close()
     for stranger in ("https://example.org", f"http://example.org:{port}", f"{url}.example.org", "null"):
-        assert view.upgrade(stranger) == 403
+        with pytest.raises(InvalidStatus, match="HTTP 403"):
+            connect(**to_it, origin=stranger)
     peer = socket.socket()
     peer.settimeout(1)
     with peer, pytest.raises(OSError):  # another address of this machine
         peer.connect(("127.0.0.2", port))
 
 
-@needs_viser
-def test_an_anchor_that_is_seen_and_not_sure_in_space_has_a_colour_of_its_own() -> None:
-    from sags_node.clients.viewer.scene import HIDDEN, SEEN, UNSURE, anchor_color
-
-    names = ("visibility", "confidence", "depth_confidence")
-    rows = [(1.0, 0.9, 0.9), (0.2, 0.5, 0.5), (1.0, 0.49, 0.9), (1.0, 0.9, 0.49), (0.0, 0.9, 0.9), (0, 0, 0)]
-    colors = [anchor_color(dict(zip(names, row, strict=True))) for row in rows]
-    assert colors == [SEEN, SEEN, UNSURE, UNSURE, HIDDEN, HIDDEN] and len({SEEN, UNSURE, HIDDEN}) == 3
-
-
-@needs_viser
-def test_the_table_of_anchors_says_which_place_is_a_guess() -> None:
-    from sags_node.clients.viewer.panel import anchor_table
-
-    row = {"id": 3, "x": 0.01, "y": 0.02, "z": 0.07, "visibility": 1.0, "confidence": 1.0}
-    assert "10.0 20.0 70.0<" in anchor_table([row | {"depth_confidence": 0.5}], "mm")
-    assert "10.0 20.0 70.0, a guess<" in anchor_table([row | {"depth_confidence": 0.05}], "mm")
-    lost = anchor_table([row | {"x": np.nan, "depth_confidence": 0.0}], "mm")
-    assert "lost<" in lost and "guess" not in lost
-
-
 # ---- in a browser ----------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def page(view: RunningView) -> Iterator[Any]:
-    """The viewer's page in a headless browser; `page.requests` are the addresses it asked for."""
-    with new_page(SOFTWARE_GL, viewport={"width": 1050, "height": 400}) as page:
+@contextmanager
+def opened(url: str, width: int, height: int) -> Iterator[Any]:
+    """A page in a headless browser; `page.requests` are the addresses it asked for."""
+    with new_page(SOFTWARE_GL, viewport={"width": width, "height": height}) as page:
         page.set_default_timeout(30_000)
         page.requests = []
         page.add_init_script(KEEP_ERRORS)
         page.on("request", lambda request: page.requests.append(request.url))
-        page.goto(view.where["url"])
+        page.goto(url)
+        page.wait_for_selector("#sags-status")
+        yield page
+
+
+@pytest.fixture(scope="module")
+def page(view: RunningView) -> Iterator[Any]:
+    with opened(view.url, 1050, 400) as page:
         page.wait_for_selector("canvas")
         yield page
 
@@ -439,17 +410,13 @@ def anchors(subscriber: Subscriber) -> dict[int, np.ndarray]:
     return dict(zip(cloud.points["id"].tolist(), cloud.xyz(), strict=True))
 
 
-@needs_viser
 def test_without_a_node_it_says_so(page: Any) -> None:
     until(lambda: "no node runs as 'sags'" in status(page), page)
     assert contrast(page) < 2, "an empty scene"
 
 
-@needs_viser
 @pytest.mark.fault("link: stands still, to the viewer's page")
-def test_a_page_that_hears_nothing_covers_itself_and_a_folded_one_does_not(
-    page: Any, view: RunningView
-) -> None:
+def test_a_page_that_hears_nothing_covers_itself_but_not_a_folded_one(page: Any, view: RunningView) -> None:
     cover = page.locator("#sags-still")
     page.mouse.click(1037, 8)  # viser's button that folds the panels away, and the status with them
     page.wait_for_function("() => document.getElementById('sags-status') === null")
@@ -467,7 +434,6 @@ def test_a_page_that_hears_nothing_covers_itself_and_a_folded_one_does_not(
     page.wait_for_function("() => document.getElementById('sags-status') !== null")
 
 
-@needs_viser
 def test_a_live_node_is_shown_obeys_and_disappears(
     page: Any, view: RunningView, node: subprocess.Popen[str]
 ) -> None:
@@ -493,7 +459,7 @@ def test_a_live_node_is_shown_obeys_and_disappears(
         page.get_by_role("button", name="Remove", exact=True).click()
         until(lambda: anchors(subscriber) == {}, page)
     page.get_by_label("Show", exact=True).click()
-    page.get_by_role("option", name="Depth under the cursor").click()
+    page.get_by_role("option", name=UNDER_CURSOR).click()
     picture = page.locator("img").first.bounding_box()
     page.mouse.move(picture["x"] + picture["width"] / 4, picture["y"] + 60)
     until(lambda: " mm" in str(page.locator("#sags-depth").text_content()), page)
@@ -522,70 +488,53 @@ def test_a_live_node_is_shown_obeys_and_disappears(
     node.kill()
     until(lambda: "stale for" in status(page), page)
     until(lambda: contrast(page) < 2, page)
-    own = (view.where["url"], f"blob:{view.where['url']}", "data:")
+    own = (view.url, f"blob:{view.url}", "data:")
     assert page.requests and all(request.startswith(own) for request in page.requests)
 
 
 # ---- in a browser, without a node ------------------------------------------------------------------------
 
 
-class Shown:
+class Shown(NamedTuple):
     """A page of moments that a test makes."""
 
-    def __init__(self, server: Any, panel: Any, scene: Any, page: Any) -> None:
-        self.server, self.panel, self.scene, self.page = server, panel, scene, page
-        self.moment = Moment("nothing yet")
+    served: Served
+    page: Any
+    moments: list[Moment]
 
     def update(self, _: int) -> None:
         """Bring the page up to date, as the command does again and again: else it covers itself."""
-        with self.server.atomic():
-            self.scene.show(self.moment)
-            self.panel.show(self.moment)
-        self.server.flush()
+        with self.served.server.atomic():
+            self.served.scene.show(self.moments[-1])
+            self.served.panel.show(self.moments[-1])
+        self.served.server.flush()
         time.sleep(0.5)
 
     def show(self, moment: Moment) -> None:
         """Show it, and wait until the page has it."""
-        self.moment, expected = moment, str(moment.t_capture_ns)
+        self.moments.append(moment)
+        expected = str(moment.t_capture_ns)
         until(lambda: self.page.locator("#sags-status").get_attribute("data-frame") == expected, self.page)
 
 
 @pytest.fixture
-def narrow() -> Iterator[Shown]:
+def narrow(served: Served) -> Iterator[Shown]:
     """The viewer's page in a window of 600 px."""
-    from sags_node.clients.viewer.panel import Panel
-    from sags_node.clients.viewer.scene import Scene
-    from sags_node.clients.viewer.server import serving
-
-    def export(gaussians: Gaussians, camera: Camera, t_capture_ns: int, kind: str) -> bytes:
-        return f"{kind} of {len(gaussians)} at {t_capture_ns}".encode()
-
-    with serving("127.0.0.1", 0, False) as (server, url):
-        scene = Scene(server)
-        panel = Panel(server, scene, THE_NODE, export, 20.0)
-        server.on_client_connect(panel.fit)
-        with new_page(SOFTWARE_GL, viewport={"width": 600, "height": 800}) as page:
-            page.set_default_timeout(30_000)
-            page.add_init_script(KEEP_ERRORS)
-            page.goto(url)
-            page.wait_for_selector("#sags-status")
-            shown = Shown(server, panel, scene, page)
-            with repeating(shown.update):
-                yield shown
-            assert page.evaluate("window.errors") == []
+    served.server.on_client_connect(served.panel.fit)
+    with opened(served.url, 600, 800) as page:
+        shown = Shown(served, page, [Moment("nothing yet")])
+        with repeating(shown.update):
+            yield shown
+        assert page.evaluate("window.errors") == []
 
 
 def at(stamp_ns: int) -> Moment:
     """With an anchor whose depth is a guess, and an object that it holds."""
-    thing = Thing(
-        "the hepatic artery", unsure="its anchors were not recognised for 2 s", anchors=({"id": 12.0},)
-    )
-    return replace(
-        moment(), t_capture_ns=stamp_ns, anchors=anchors_of(12), overlay=Overlay("running", objects=(thing,))
-    )
+    why = "its anchors were not recognised for 2 s"
+    overlay = Overlay("running", objects=(Thing("the hepatic artery", None, why, ({"id": 12.0},)),))
+    return replace(moment(), t_capture_ns=stamp_ns, anchors=anchors_of(12), overlay=overlay)
 
 
-@needs_viser
 def test_the_page_counts_the_frames_that_come_to_it(narrow: Shown) -> None:
     stamps = [7, 7, 0, 8, 9, 0, 9, 10]  # shown again, and nothing to show
     before = narrow.page.evaluate("performance.now()")
@@ -596,7 +545,6 @@ def test_the_page_counts_the_frames_that_come_to_it(narrow: Shown) -> None:
     until(lambda: narrow.page.locator("#sags-rate").text_content() == "0 /s", narrow.page)
 
 
-@needs_viser
 def test_the_buttons_give_the_moment_that_is_shown_as_files(narrow: Shown) -> None:
     from sags_node.clients.viewer.saving import KINDS
 
@@ -635,7 +583,6 @@ SIDEWAYS = """() => [...document.querySelectorAll("*")].filter((each) =>
 ).map((each) => each.outerHTML.slice(0, 200))"""
 
 
-@needs_viser
 def test_in_a_window_of_600_px_all_is_reached_without_scrolling_sideways(narrow: Shown) -> None:
     page = narrow.page
     narrow.show(at(1))
@@ -647,7 +594,7 @@ def test_in_a_window_of_600_px_all_is_reached_without_scrolling_sideways(narrow:
     for stamp_ns, view in enumerate(VIEWS, 2):
         page.get_by_label("Show", exact=True).click()
         page.get_by_role("option", name=view, exact=True).click()
-        until(lambda view=view: narrow.panel.view == view, page)
+        until(lambda view=view: narrow.served.panel.view == view, page)
         narrow.show(at(stamp_ns))
         assert page.evaluate("document.documentElement.scrollWidth") <= 600
         assert page.evaluate(SIDEWAYS) == [] and page.evaluate(OUT_OF_REACH) == []
