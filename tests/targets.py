@@ -20,7 +20,7 @@ ROOT = Path(__file__).parent.parent
 TESTS = tuple(
     ROOT / "tests" / room / f"test_{name}.py"
     for room, names in {
-        "engine": ("rasterizer", "cpu_rasterizer", "projection", "losses", "colours", "adam", "kernels"),
+        "engine": ("rasterizer", "cpu_rasterizer", "twin", "losses", "adam", "kernels"),
         "field": ("hexplane", "decoder", "deformation", "paper_losses"),
         "fitting": ("residuals",),
         "mapping": ("slopes",),
