@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,10 +54,10 @@ def _by_protocol(own: Callable[..., None], protocol: str | None, **arguments: An
     if protocol is None:
         own(**arguments)
     else:
-        evaluate_protocol(protocol, **arguments)
+        _measure(protocol, **arguments)
 
 
-def evaluate_protocol(
+def _measure(
     protocol: str,
     launch: tuple[str, ...],
     iterations: int | None,
@@ -65,15 +66,7 @@ def evaluate_protocol(
     json_out: bool,
     **others: Any,
 ) -> None:
-    """Measure a data set by its protocol.
-
-    Args:
-        others: options of `sags eval` that no protocol takes.
-
-    Raises:
-        UsageError: one of `others` is given, or the folder is wrong.
-        SagsError: the data set cannot be measured.
-    """
+    """Measure a data set by its protocol. `others`: options of `sags eval` that no protocol takes."""
     from sags_lab.protocols import run
     from sags_lab.protocols.d4d import measure_d4d
 
@@ -94,25 +87,21 @@ def evaluate_protocol(
         def tell(done: int, what: str) -> None:
             advance(done, None, what)
 
-        if protocol == "endonerf":
-            found = run.measure_endonerf(Path(path), overrides, lpips_weights, tell)
-        else:
-            measures = {
-                "d4d": measure_d4d,
-                "scared": run.measure_scared,
-                "stereomis": run.measure_stereomis,
-                "stir": run.measure_stir,
-            }
-            found = measures[protocol](Path(path), overrides, tell)
-    found = {"protocol": protocol, **found}
+        measures: dict[str, Callable[..., dict[str, Any]]] = {
+            "d4d": measure_d4d,
+            "endonerf": partial(run.measure_endonerf, lpips=lpips_weights),
+            "scared": run.measure_scared,
+            "stereomis": run.measure_stereomis,
+            "stir": run.measure_stir,
+        }
+        found = {"protocol": protocol, **measures[protocol](Path(path), overrides, progress=tell)}
     if json_out:
         show(found)
     else:
         table = text.table()
         for key, value in flat(found).items():
-            table.add_row(
-                key, "–" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
-            )
+            shown = "–" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+            table.add_row(key, shown)
         show(table)
     write_json(out, found)
 

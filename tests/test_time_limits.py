@@ -12,7 +12,6 @@ import pytest
 from command_line import RUN_HERE
 from places import SESSION
 
-from benchmarks.node import transport
 from sags_node import processes
 from sags_node.config.schema import V4l2Source
 from sags_node.errors import SagsError
@@ -94,9 +93,3 @@ def test_a_driver_that_does_not_come_back_does_not_keep_the_node(
     finally:
         HungCamera.released.set()
     assert caplog.text.count("driver does not answer") == 2
-
-
-def test_a_receiver_that_never_comes_ends_the_transport_benchmark(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transport, "STARTING", 0.01)
-    with pytest.raises(SagsError, match="did not start"):
-        transport.measure_transport(1)

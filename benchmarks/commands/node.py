@@ -7,31 +7,35 @@ from typing import TYPE_CHECKING
 
 import click
 
-from benchmarks.commands.measuring import Measured, each_recording, measures, split, step_by_step
+from benchmarks.commands.measuring import (
+    Measured,
+    each_recording,
+    made_ready,
+    measures,
+    recordings_argument,
+    split,
+    step_by_step,
+    writes,
+)
 from sags_node.cli.launching import (
-    as_json,
-    check_files,
-    figures_option,
     file_option,
     force_option,
     launch_argument,
     open_launched,
     positive,
     shown,
-    write_json,
 )
 from sags_node.errors import SagsError, UsageError
-from sags_node.files import whole
-from sags_node.terminal.console import progress, show
 from sags_node.tools.evaluation.plots import check_plots
 
 if TYPE_CHECKING:
+    from benchmarks import Advance
     from benchmarks.node.endurance import Order
     from benchmarks.quality.scope import Motion
 
 
 @click.command("pareto")
-@click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml | SESSION]... [key:=value ...]")
+@recordings_argument
 @click.option(
     "--only",
     metavar="PARTS",
@@ -44,35 +48,23 @@ if TYPE_CHECKING:
     default=1,
     help="Play each setting so often; the run of middle speed counts.",
 )
-@click.option(
-    "--fit",
-    "fits",
-    multiple=True,
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE.json",
-    help="Figures of sags fit, for the session they name. Default: benchmarks/results/fit_*.json.",
-)
-@figures_option
 @file_option("--plot", metavar="FILE.png", help="Draw the image's quality over the time of a frame.")
 @force_option
-@as_json
+@measures("measuring", "plot")
 def bench_pareto(
     launch: tuple[str, ...],
     only: str | None,
     frames: int | None,
     repeat: int,
-    fits: tuple[Path, ...],
-    out: Path | None,
     plot: Path | None,
-    force: bool,
-    json_out: bool,
-) -> None:
+    advance: Advance,
+) -> Measured:
     """Run time against error of the online mapper.
 
     Plays recordings, by default the built-in phantom, with other time budgets, working sizes and numbers of
     Gaussians than their launch files say, and with each rule that skips work on and off. Settings that no
     other beats in both time and image are marked. Beside them: the previous image shown again, the left
-    image warped into the right eye, stereo alone, and the offline fit.
+    image warped into the right eye, stereo alone, and the offline fit (benchmarks/results/fit_*.json).
 
     A smaller working size is measured at that size, and once more at the launch file's, for which its
     Gaussians are drawn there: the figure to compare. Takes three to five seconds per frame.
@@ -86,28 +78,18 @@ def bench_pareto(
     python -m benchmarks pareto launch/d4d_pull.yaml launch/phantom.yaml source.start:=2 --frames 50 \\
         --out benchmarks/results/pareto.json --plot docs/pareto.png
     """
-    from benchmarks.pareto import plot as pareto_plot
-    from benchmarks.pareto import report as pareto_report
-    from benchmarks.pareto.baselines import read_fits
-    from benchmarks.pareto.measure import measure_pareto
+    from benchmarks.pareto import measure
+    from benchmarks.pareto.plot import picture
     from benchmarks.pareto.settings import PARTS, Sweep
 
     paths, overrides = each_recording(launch, "pareto")
     if frames is not None:
         overrides.append(f"source.frames:={frames}")
     sweep = Sweep(PARTS if only is None else tuple(only.split(",")), repeat)
-    known_fits = read_fits(fits or sorted(Path("benchmarks/results").glob("fit_*.json")))
-    check_files(out, plot, force=force)
     if plot is not None:
         check_plots()
-    with progress("measuring") as advance:
-        measured = measure_pareto(paths, overrides, sweep, known_fits, advance)
-    for table in [measured] if json_out else pareto_report.tables(measured):
-        show(table)
-    write_json(out, measured)
-    if plot is not None:
-        with whole(plot) as partial:
-            partial.write_bytes(pareto_plot.picture(measured))
+    measured = measure.measure_pareto(paths, overrides, sweep, advance)
+    return measured, measure.TABLES, writes(plot, lambda: picture(measured))
 
 
 @click.command("endurance")
@@ -121,8 +103,10 @@ def bench_pareto(
     help="Without a jump; from the start again after the last frame; or a random walk that never repeats.",
 )
 @shown("--seed", type=int, default=0, help="Of the walk and the camera's noise.")
-@measures
-def bench_endurance(launch: tuple[str, ...], frames: int, window: int, order: Order, seed: int) -> Measured:
+@measures("playing")
+def bench_endurance(
+    launch: tuple[str, ...], frames: int, window: int, order: Order, seed: int, advance: Advance
+) -> Measured:
     """Whether the node lasts: thousands of frames in a row.
 
     Plays a recording, by default the built-in phantom, over and over, with the launch file's time budget and
@@ -136,9 +120,8 @@ def bench_endurance(launch: tuple[str, ...], frames: int, window: int, order: Or
     from benchmarks.node import endurance
 
     session = step_by_step(launch, "endurance")
-    with progress("playing") as advance:
-        measured = endurance.measure_endurance(session, frames, window, order, advance, seed)
-    return measured, [endurance.table(measured), endurance.statement(measured)]
+    measured = endurance.measure_endurance(session, frames, window, order, advance, seed)
+    return measured, endurance.TABLES
 
 
 @click.command("soak")
@@ -153,11 +136,8 @@ def bench_endurance(launch: tuple[str, ...], frames: int, window: int, order: Or
 @click.option(
     "--check", is_flag=True, help="Fail if a figure gets worse beyond its scatter, by a tenth an hour."
 )
-@figures_option
-@as_json
-def bench_soak(
-    launch: tuple[str, ...], frames: int, window: int, check: bool, out: Path | None, json_out: bool
-) -> None:
+@measures("running")
+def bench_soak(launch: tuple[str, ...], frames: int, window: int, check: bool, advance: Advance) -> Measured:
     """Whether a live node lasts beside all that uses it.
 
     Runs a node, by default of the built-in phantom, in a process of its own and in real time, with the
@@ -171,26 +151,21 @@ def bench_soak(
     """
     from benchmarks.node import soak
 
-    check_files(out)
-    path, overrides = split(launch, "soak")
-    open_launched(path, overrides)  # what takes long is not part of the node's start
-    with progress("running") as advance:
-        measured = soak.measure_soak(launch, frames, window, advance)
-    if json_out:
-        show(measured)
-    else:
-        show(soak.table(measured))
-        show(soak.statement(measured))
-    write_json(out, measured)
-    if check and (worse := soak.worsening(measured)):
-        raise SagsError(f"worse with time: {', '.join(worse)}")
+    made_ready(launch, "soak")
+    measured = soak.measure_soak(launch, frames, window, advance)
+
+    def judge() -> None:
+        if check and (worse := soak.worsening(measured)):
+            raise SagsError(f"worse with time: {', '.join(worse)}")
+
+    return measured, soak.TABLES, judge
 
 
 @click.command("tracking")
 @launch_argument
 @shown("--frames", "numbers", default="10,20,30,40,50,60,70,80,90", help="After how many frames to measure.")
-@measures
-def bench_tracking(launch: tuple[str, ...], numbers: str) -> Measured:
+@measures("following")
+def bench_tracking(launch: tuple[str, ...], numbers: str, advance: Advance) -> Measured:
     """How well anchors stay on the tissue.
 
     Pins anchors all over the first frame of a recording, follows them with one step of the mapper a frame,
@@ -201,21 +176,20 @@ def bench_tracking(launch: tuple[str, ...], numbers: str) -> Measured:
     \b
     python -m benchmarks tracking launch/d4d_pull.yaml --out benchmarks/results/tracking_d4d.json
     """
-    from benchmarks.quality import tracking, tracking_report
+    from benchmarks.quality import tracking
 
     if not all(number.strip().isdigit() and int(number) > 0 for number in numbers.split(",")):
         raise UsageError(f"--frames {numbers}: give numbers above 0 with commas between, e.g. 10,40")
     session = step_by_step(launch, "tracking")
-    with progress("following") as advance:
-        measured = tracking.measure_tracking(session, [int(n) for n in numbers.split(",")], advance)
-    return measured, tracking_report.tables(measured)
+    measured = tracking.measure_tracking(session, [int(n) for n in numbers.split(",")], advance)
+    return measured, tracking.TABLES
 
 
 @click.command("recall")
 @launch_argument
 @shown("--seconds", type=positive, default=10.0, help="Out of sight.")
-@measures
-def bench_recall(launch: tuple[str, ...], seconds: float) -> Measured:
+@measures("following")
+def bench_recall(launch: tuple[str, ...], seconds: float, advance: Advance) -> Measured:
     """Whether anchors come back after a long time out of sight.
 
     Pins anchors to the phantom's tissue. Then a cloth covers it, or it is dark and the scope moves, or the
@@ -230,9 +204,7 @@ def bench_recall(launch: tuple[str, ...], seconds: float) -> Measured:
 
     path, overrides = split(launch, "recall", "needs the phantom")
     session = open_launched(path, [*overrides, "source.pace:=step"])
-    with progress("following") as advance:
-        measured = recall.measure_recall(session, seconds, advance)
-    return measured, recall.tables(measured)
+    return recall.measure_recall(session, seconds, advance), recall.TABLES
 
 
 @click.command("scope")
@@ -245,8 +217,10 @@ def bench_recall(launch: tuple[str, ...], seconds: float) -> Measured:
     help="This one alone; may be given several times. Default: all.",
 )
 @shown("--seconds", type=positive, default=120.0, help="Of each motion.")
-@measures
-def bench_scope(launch: tuple[str, ...], motions: tuple[Motion, ...], seconds: float) -> Measured:
+@measures("following")
+def bench_scope(
+    launch: tuple[str, ...], motions: tuple[Motion, ...], seconds: float, advance: Advance
+) -> Measured:
     """How accurate the pose of a moving scope stays.
 
     The phantom's scope sways, zooms and orbits over breathing, pulled tissue, at 10 Hz. Its pose is given,
@@ -260,24 +234,19 @@ def bench_scope(launch: tuple[str, ...], motions: tuple[Motion, ...], seconds: f
     from benchmarks.quality import scope
     from sags_node.config.launch_file import load_launch
 
-    path, overrides = split(launch, "scope", "needs the phantom")
-    with progress("following") as advance:
-        measured = scope.measure_scope(
-            load_launch(path, overrides), motions or scope.MOTIONS, seconds, advance
-        )
-    return measured, [scope.table(measured)]
+    config = load_launch(*split(launch, "scope", "needs the phantom"))
+    return scope.measure_scope(config, motions or scope.MOTIONS, seconds, advance), scope.TABLES
 
 
 @click.command("crowd")
 @launch_argument
 @shown("--seconds", type=positive, default=60.0, help="With the crowd; a quarter for each of the others.")
-@shown("--many", type=click.IntRange(0, 50), default=20, help="Further subscribers.")
-@measures
-def bench_crowd(launch: tuple[str, ...], seconds: float, many: int) -> Measured:
+@measures("listening")
+def bench_crowd(launch: tuple[str, ...], seconds: float, advance: Advance) -> Measured:
     """Whether subscribers disturb the node.
 
     Runs a node, by default of the built-in phantom, in a process of its own: alone; with one reader of
-    everything; and with a fast subscriber, a slow one (200 ms a frame), a dead one (never reads) and many
+    everything; and with a fast subscriber, a slow one (200 ms a frame), a dead one (never reads) and twenty
     more, each group in its own process. The node's rate, latency and memory, and how old the frames are that
     the subscribers take.
 
@@ -286,18 +255,15 @@ def bench_crowd(launch: tuple[str, ...], seconds: float, many: int) -> Measured:
     """
     from benchmarks.node import crowd
 
-    path, overrides = split(launch, "crowd")
-    open_launched(path, overrides)  # what takes long is not part of the node's start
-    with progress("listening") as advance:
-        measured = crowd.measure_crowd(launch, seconds / 4, seconds, many, advance)
-    return measured, [crowd.table(measured)]
+    made_ready(launch, "crowd")
+    return crowd.measure_crowd(launch, seconds / 4, seconds, advance), crowd.TABLES
 
 
 @click.command("bridges")
 @launch_argument
 @shown("--seconds", type=positive, default=30.0, help="Of each bridge.")
-@measures
-def bench_bridges(launch: tuple[str, ...], seconds: float) -> Measured:
+@measures("listening")
+def bench_bridges(launch: tuple[str, ...], seconds: float, advance: Advance) -> Measured:
     """What each bridge gives and costs.
 
     Runs a node, by default of the built-in phantom, in a process of its own: alone, and beside each bridge of
@@ -309,34 +275,15 @@ def bench_bridges(launch: tuple[str, ...], seconds: float) -> Measured:
     """
     from benchmarks.node import bridges
 
-    path, overrides = split(launch, "bridges")
-    open_launched(path, overrides)  # what takes long is not part of the node's start
-    with progress("listening") as advance:
-        rows = bridges.measure_bridges(launch, seconds, advance)
-    return rows, [bridges.table(rows)]
-
-
-@click.command("transport")
-@shown("--frames", type=click.IntRange(1), default=150, help="Of each transport.")
-@as_json
-def bench_transport(frames: int, json_out: bool) -> None:
-    """What sending an image costs.
-
-    A 4 MB image goes to another process over ipc, tcp, and tcp with encryption. Milliseconds from the send
-    call to the arrival, at 30 frames per second. Takes 20 seconds.
-    """
-    from benchmarks.node.transport import measure_transport
-    from sags_node.terminal.text import rows_table
-
-    rows = measure_transport(frames)
-    show(rows if json_out else rows_table(rows))
+    made_ready(launch, "bridges")
+    return bridges.measure_bridges(launch, seconds, advance), bridges.TABLES
 
 
 @click.command("thin")
 @launch_argument
 @shown("--frames", type=click.IntRange(1), default=60, help="To measure.")
-@measures
-def bench_thin(launch: tuple[str, ...], frames: int) -> Measured:
+@measures("making")
+def bench_thin(launch: tuple[str, ...], frames: int, advance: Advance) -> Measured:
     """What thin images cost.
 
     Plays a recording, by default the built-in phantom, and makes each kind of thin image of every frame
@@ -345,20 +292,16 @@ def bench_thin(launch: tuple[str, ...], frames: int) -> Measured:
     \b
     python -m benchmarks thin launch/d4d_pull.yaml --out benchmarks/results/thin.json
     """
-    from benchmarks.node.thin import measure_thin
-    from sags_node.terminal.text import rows_table
+    from benchmarks.node import thin
 
-    session = step_by_step(launch, "thin")
-    with progress("making") as advance:
-        rows = measure_thin(session, frames, advance)
-    return rows, [rows_table(rows)]
+    return thin.measure_thin(step_by_step(launch, "thin"), frames, advance), thin.TABLES
 
 
 @click.command("inputs")
 @shown("--seconds", type=positive, default=10.0, help="Of each way.")
 @click.option("--only", metavar="NAME", help="Ways that begin so, e.g. gst; default: all.")
-@measures
-def bench_inputs(seconds: float, only: str | None) -> Measured:
+@measures("listening")
+def bench_inputs(seconds: float, only: str | None, advance: Advance) -> Measured:
     """What a live pair costs until the mapper has it.
 
     Two images of 1280x1024 px, 30 times a second, by each way into the node (docs/inputs.md). CPU time of a
@@ -368,9 +311,6 @@ def bench_inputs(seconds: float, only: str | None) -> Measured:
     \b
     python -m benchmarks inputs --out benchmarks/results/inputs.json
     """
-    from benchmarks.node.inputs import measure_inputs
-    from sags_node.terminal.text import rows_table
+    from benchmarks.node import inputs
 
-    with progress("listening") as advance:
-        rows = measure_inputs(seconds, only, advance)
-    return rows, [rows_table(rows)]
+    return inputs.measure_inputs(seconds, only, advance), inputs.TABLES

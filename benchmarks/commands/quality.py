@@ -8,11 +8,19 @@ from typing import TYPE_CHECKING
 
 import click
 
-from benchmarks.commands.measuring import STEP, Measured, each_recording, measures, split, step_by_step
+from benchmarks.commands.measuring import (
+    Measured,
+    each_recording,
+    measures,
+    recordings_argument,
+    seeds_option,
+    split,
+    step_by_step,
+    writes,
+)
 from sags_node.cli.launching import (
-    as_json,
+    STEPWISE,
     check_files,
-    figures_option,
     file_option,
     folder_option,
     force_option,
@@ -20,27 +28,18 @@ from sags_node.cli.launching import (
     open_launched,
     positive,
     shown,
-    write_json,
 )
 from sags_node.errors import UsageError
 from sags_node.files import whole
-from sags_node.terminal.console import progress, show
 
 if TYPE_CHECKING:
+    from benchmarks import Advance
     from benchmarks.quality.disturbances import Shot
-
-FAULT_SIZE = (640, 512)  # px
-FAULT_FRAMES = 4
 
 
 @click.command("depth")
 @launch_argument
-@click.option(
-    "--ct",
-    type=click.Path(path_type=Path, file_okay=False),
-    metavar="FOLDER",
-    help="One pair of the Open-CAS set against its CT surface, instead of a recording.",
-)
+@folder_option("--ct", help="One pair of the Open-CAS set against its CT surface, instead of a recording.")
 @click.option("--faults", is_flag=True, help="The phantom with noise, blur, smoke and highlights rising.")
 @click.option(
     "--network",
@@ -48,20 +47,17 @@ FAULT_FRAMES = 4
     metavar="FILE.onnx",
     help="A depth network to compare as well.",
 )
-@figures_option
 @file_option("--picture", metavar="FILE.jpg", help="With --ct: draw the left image, the depth and its error.")
 @force_option
-@as_json
+@measures("measuring", "picture")
 def bench_depth(
     launch: tuple[str, ...],
     ct: Path | None,
     faults: bool,
     network: Path | None,
-    out: Path | None,
     picture: Path | None,
-    force: bool,
-    json_out: bool,
-) -> None:
+    advance: Advance,
+) -> Measured:
     """How accurate the depth is, and how complete.
 
     The stereo stage at every scale, beside OpenCV's SGBM in its place and as its own sample sets it up, and a
@@ -79,36 +75,25 @@ def bench_depth(
     python -m benchmarks depth --faults --out benchmarks/results/depth_phantom.json
     python -m benchmarks depth launch/d4d_pull.yaml --network stereo.onnx
     """
-    from benchmarks.quality import depth, depth_ct, depth_report
+    from benchmarks.quality import depth, depth_ct
 
     if (ct is not None) + faults + bool(launch) > 1:
         raise UsageError("a recording, --ct or --faults: give one of them")
     if picture is not None and ct is None:
         raise UsageError("--picture draws what --ct measures; add --ct FOLDER")
-    check_files(out, picture, force=force)
     if ct is not None:
         pair = depth_ct.read_ct_pair(ct)
-        with progress("measuring") as advance:
-            measured = depth_ct.measure_ct(pair, advance, network)
-        if picture is not None:
-            with whole(picture) as partial:
-                partial.write_bytes(depth_ct.picture(pair))
-    elif faults:
-        with progress("measuring") as advance:
-            measured = depth.measure_faults(FAULT_SIZE, FAULT_FRAMES, depth.FAULTS, advance, network)
-    else:
-        session = step_by_step(launch, "depth")
-        with progress("playing") as advance:
-            measured = depth.measure_recording(session, advance, network=network)
-    for table in [measured] if json_out else depth_report.tables(measured):
-        show(table)
-    write_json(out, measured)
+        measured = depth_ct.measure_ct(pair, advance, network)
+        return measured, depth.TABLES, writes(picture, lambda: depth_ct.picture(pair))
+    if faults:
+        return depth.measure_faults(advance, network), depth.TABLES
+    return depth.measure_recording(step_by_step(launch, "depth"), advance, network), depth.TABLES
 
 
 @click.command("masks")
-@click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml | SESSION]... [key:=value ...]")
-@measures
-def bench_masks(launch: tuple[str, ...]) -> Measured:
+@recordings_argument
+@measures("playing")
+def bench_masks(launch: tuple[str, ...], advance: Advance) -> Measured:
     """How accurate the masks are that the node finds, and what they gain.
 
     Plays recordings that have masks of their own, by default the built-in phantom, once with these, once with
@@ -126,19 +111,18 @@ def bench_masks(launch: tuple[str, ...]) -> Measured:
     methods = ["session", "classical", "none"]
     if any(override.startswith("vision.tissue.path:=") for override in overrides):
         methods.append("onnx")
-    rows = []
-    for path in paths:
-        for method in methods:
-            session = open_launched(path, [*overrides, *STEP, f"vision.tissue.method:={method}"])
-            with progress("playing") as advance:
-                rows.append(masks.measure_masks(session, advance))
-    return rows, [masks.table(rows)]
+    played = [
+        open_launched(path, [*overrides, *STEPWISE, f"vision.tissue.method:={method}"])
+        for path in paths
+        for method in methods
+    ]
+    return [masks.measure_masks(session, advance) for session in played], masks.TABLES
 
 
 @click.command("lengths")
 @launch_argument
-@measures
-def bench_lengths(launch: tuple[str, ...]) -> Measured:
+@measures("measuring")
+def bench_lengths(launch: tuple[str, ...], advance: Advance) -> Measured:
     """How accurate lengths and areas between anchors are, and whether their stated errors are true.
 
     Anchors are pinned at points of the phantom that its first frame shows. Every fifth frame distances, paths
@@ -150,15 +134,13 @@ def bench_lengths(launch: tuple[str, ...]) -> Measured:
     """
     from benchmarks.quality import measuring
 
-    with progress("measuring") as advance:
-        measured = measuring.measure_lengths(step_by_step(launch, "lengths"), advance)
-    return measured, measuring.tables(measured)
+    return measuring.measure_lengths(step_by_step(launch, "lengths"), advance), measuring.TABLES
 
 
 @click.command("strain")
-@shown("--seeds", type=click.IntRange(1), default=3, help="Phantoms, each pulled once.")
-@measures
-def bench_strain(seeds: int) -> Measured:
+@seeds_option(3, "Phantoms, each pulled once.")
+@measures("straining")
+def bench_strain(seeds: int, advance: Advance) -> Measured:
     """How accurate the strain of the tissue is, in the columns `strain_max` and `strain_min` of `points`.
 
     The phantom is pulled. Truth is its grid, by central differences; beside it the value 0, which
@@ -169,16 +151,14 @@ def bench_strain(seeds: int) -> Measured:
     """
     from benchmarks.quality import straining
 
-    with progress("straining") as advance:
-        measured = straining.measure_strain(seeds, advance)
-    return measured, straining.tables(measured)
+    return straining.measure_strain(seeds, advance), straining.TABLES
 
 
 @click.command("registration")
 @folder_option("--ct", help="The pair of the Open-CAS set with its CT surface, too.")
-@shown("--seeds", type=click.IntRange(1), default=20, help="Phantoms, and errors of the picked points.")
-@measures
-def bench_registration(ct: Path | None, seeds: int) -> Measured:
+@seeds_option(20, "Phantoms, and errors of the picked points.")
+@measures("registering")
+def bench_registration(ct: Path | None, seeds: int, advance: Advance) -> Measured:
     """How accurately a model is placed on tissue, and whether the stated errors are true.
 
     A part of the phantom's surface, moved, is registered to what the node measures of it in a second, from
@@ -191,15 +171,13 @@ def bench_registration(ct: Path | None, seeds: int) -> Measured:
     """
     from benchmarks.quality import registration
 
-    with progress("registering") as advance:
-        measured = registration.measure_registration(ct, seeds, advance)
-    return measured, registration.tables(measured)
+    return registration.measure_registration(ct, seeds, advance), registration.TABLES
 
 
 @click.command("deform")
-@shown("--seeds", type=click.IntRange(1), default=5, help="Phantoms.")
-@measures
-def bench_deform(seeds: int) -> Measured:
+@seeds_option(5, "Phantoms.")
+@measures("pulling")
+def bench_deform(seeds: int, advance: Advance) -> Measured:
     """How well a registered model follows tissue that is pulled.
 
     A part of the phantom's surface, and the same 5, 10 and 20 mm below it, is held by anchors while the
@@ -212,15 +190,13 @@ def bench_deform(seeds: int) -> Measured:
     """
     from benchmarks.quality import deform
 
-    with progress("pulling") as advance:
-        measured = deform.measure_deform(seeds, advance)
-    return measured, deform.tables(measured)
+    return deform.measure_deform(seeds, advance), deform.TABLES
 
 
 @click.command("instruments")
-@shown("--seeds", type=click.IntRange(1), default=4, help="Phantoms, each with other instruments before it.")
-@measures
-def bench_instruments(seeds: int) -> Measured:
+@seeds_option(4, "Phantoms, each with other instruments before it.")
+@measures("placing")
+def bench_instruments(seeds: int, advance: Advance) -> Measured:
     """How accurate the tips, axes, distances and confidence of the topic `instruments` are.
 
     Instruments are put before the phantom, 5 to 40 mm from the tissue: one, two, crossing, and leaving the
@@ -232,10 +208,9 @@ def bench_instruments(seeds: int) -> Measured:
     """
     from benchmarks.quality import instruments, kinematics
 
-    with progress("placing") as advance:
-        measured = instruments.measure_instruments(seeds, advance)
-        measured["kinematics"] = kinematics.measure_kinematics(seeds, advance)
-    return measured, [*instruments.tables(measured), kinematics.table(measured["kinematics"])]
+    measured = instruments.measure_instruments(seeds, advance)
+    measured["kinematics"] = kinematics.measure_kinematics(seeds, advance)
+    return measured, instruments.TABLES
 
 
 @click.command("disturbances")
@@ -259,25 +234,21 @@ def bench_instruments(seeds: int) -> Measured:
     default=1.0,
     help="That each lasts; dark (0.5 s), flash (2 frames) and cut (10 frames) at most so long.",
 )
-@click.option(
+@folder_option(
     "--pictures",
-    type=click.Path(path_type=Path, file_okay=False),
-    metavar="DIR",
     help="Write a PNG for each: both eyes as they came, the model and its depth, before, amid and after.",
 )
-@figures_option
 @force_option
-@as_json
+@measures("playing")
 def bench_disturbances(
     launch: tuple[str, ...],
     only: tuple[str, ...],
     start: int | None,
     seconds: float,
     pictures: Path | None,
-    out: Path | None,
     force: bool,
-    json_out: bool,
-) -> None:
+    advance: Advance,
+) -> Measured:
     """What bad images do to the node.
 
     Plays a recording with both eyes, by default the built-in phantom, once for each disturbance, frame by
@@ -303,7 +274,7 @@ def bench_disturbances(
     python -m benchmarks disturbances --only fog_right --only late_right
     """
     from benchmarks.disturbances import DISTURBANCES
-    from benchmarks.quality import disturbances, disturbances_report
+    from benchmarks.quality import disturbances
 
     for name in set(only) - set(DISTURBANCES):
         near = difflib.get_close_matches(name, DISTURBANCES, n=1)
@@ -311,16 +282,14 @@ def bench_disturbances(
         raise UsageError(f"--only: unknown disturbance '{name}'; {hint}")
     path, overrides = split(launch, "disturbances")
     names = only or tuple(DISTURBANCES)
-    drawn = [] if pictures is None else [pictures / f"{name}.png" for name in ("clean", *names)]
-    check_files(out, *drawn, force=force)
+    if pictures is not None:
+        check_files(*(pictures / f"{name}.png" for name in ("clean", *names)), force=force)
 
     def draw(name: str, shots: list[Shot]) -> None:
         if pictures is not None:
             with whole(pictures / f"{name}.png") as file:
-                file.write_bytes(disturbances_report.strip(shots))
+                file.write_bytes(disturbances.strip(shots))
 
-    session = open_launched(path, ["vision.tissue.method:=classical", *overrides, *STEP])
-    with progress("playing") as advance:
-        measured = disturbances.measure_disturbances(session, names, start, seconds, advance, draw)
-    show(measured if json_out else disturbances_report.table(measured))
-    write_json(out, measured)
+    session = open_launched(path, ["vision.tissue.method:=classical", *overrides, *STEPWISE])
+    measured = disturbances.measure_disturbances(session, names, start, seconds, advance, draw)
+    return measured, disturbances.TABLES

@@ -19,11 +19,6 @@ class Disturbance:
     seconds: float | None = None  # how long it lasts; None: all the time that is given
     frames: int | None = None  # how many frames it lasts, at any rate; None: see `seconds`
 
-    @property
-    def says(self) -> str:
-        """The disturbance in words: the first sentence of the docstring of `change`."""
-        return (self.change.__doc__ or "").split(". ")[0].rstrip(".").replace("\n    ", " ")
-
     def length(self, whole: int, rate: float) -> int:
         """Return how many of `whole` given frames it lasts, at `rate` frames per second."""
         if self.frames is not None:

@@ -25,7 +25,6 @@ DEPTH_WEIGHT, DEPTH_SCALE = 2e-3, 1e-3  # as the mapper's
 # per value: it and its two moments are read and written, its gradient is read
 ADAM_FLOATS, ADAM_OPERATIONS = 7, 14
 
-MILLION = 1_000_000
 GAUSSIAN_COLUMNS, CELL_COLUMNS = 14, 32
 ACTIVE_SHARES = (0.5, 0.25, 0.1, 0.05)
 
@@ -42,7 +41,14 @@ class Settings:
     contention: bool = False  # also time beside another process that burns a core
 
 
-QUICK = Settings(counts=(500,), sizes=((64, 64),), runs=3)
+QUICK = Settings(counts=(500,), sizes=((64, 64),), runs=3, twin=False)
+TABLES = (
+    "threads operations_per_s",
+    "n width height scene active_tiles sh_degree threads forward_ms share_of_peak twin_forward_backward_ms"
+    " speedup_over_twin forward_backward_ms",
+    "n width height scene active_tiles sh_degree threads stage ms share_of_peak pairs_per_s bound",
+    "n width height p90 p50",
+)
 
 
 def measure_kernels(settings: Settings, advance: Advance) -> dict[str, Any]:

@@ -56,14 +56,8 @@ def shuffled(count: int, width: int, height: int) -> tuple[Gaussians, Camera]:
     """The surface, stored in random order: neighbours in the image are not neighbours in memory."""
     gaussians, camera = surface(count, width, height)
     order = np.random.default_rng(0).permutation(len(gaussians))
-    return Gaussians(
-        gaussians.means[order],
-        gaussians.quats[order],
-        gaussians.scales[order],
-        gaussians.opacities[order],
-        gaussians.colors[order],
-        gaussians.ids[order],
-    ), camera
+    names = ("means", "quats", "scales", "opacities", "colors", "ids")
+    return replace(gaussians, **{name: getattr(gaussians, name)[order] for name in names}), camera
 
 
 SCENES: Mapping[str, Callable[[int, int, int], tuple[Gaussians, Camera]]] = {

@@ -1,12 +1,9 @@
 """`benchmarks bridges`: what each bridge gives its peer, how old that is, and what it costs."""
 
 import json
-import select
 import socket
 import struct
 import subprocess
-import sys
-import tempfile
 import threading
 import time
 from collections import defaultdict
@@ -17,15 +14,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 
 from benchmarks import Advance
-from benchmarks.node.crowd import STARTING, STATUS, STOPPING, node_beside, watched
-from benchmarks.node.processes import cpu_seconds
-from benchmarks.tables import filled
+from benchmarks.node.crowd import STATUS, node_beside, watched
+from benchmarks.node.processes import (
+    STARTING,
+    STOPPING,
+    cpu_seconds,
+    first_said,
+    own_run_dir,
+    sags,
+    wait_until,
+)
 from sags_node.bags.pictures import header_stamp
 from sags_node.config.schema import RosGraph
 from sags_node.errors import SagsError
@@ -77,15 +80,15 @@ def measure_bridges(launch: Sequence[str], seconds: float, advance: Advance) -> 
     Raises:
         SagsError: a node or a bridge does not run, or a peer gets nothing.
     """
-    with tempfile.TemporaryDirectory() as folder, node_beside(launch, Path(folder)) as node:
-        with Subscriber([STATUS], run_dir=Path(folder)) as observer:
-            alone = _node_figures(_seen(observer, seconds, node, advance, "node alone"))
+    with own_run_dir() as run_dir, node_beside(launch, run_dir) as node:
+        with Subscriber([STATUS], run_dir=run_dir) as observer:
+            alone = _node_figures(watched(observer, seconds, node, advance, "node alone"))
             rows: list[dict[str, Any]] = [{"bridge": "none", **alone}]
             for case in CASES:
-                with _bridge(case, Path(folder)) as (process, heard):
+                with _bridge(case, run_dir) as (process, heard):
                     began = time.monotonic()
                     before, frames = cpu_seconds(process.pid), _frames(observer)
-                    seen = _seen(observer, seconds, node, advance, case.name)
+                    seen = watched(observer, seconds, node, advance, case.name)
                     spent, shown = cpu_seconds(process.pid) - before, _frames(observer) - frames
                     took = time.monotonic() - began
                     ages = percentiles(heard.ages_ms[case.leading])
@@ -105,32 +108,9 @@ def measure_bridges(launch: Sequence[str], seconds: float, advance: Advance) -> 
     return rows
 
 
-def table(rows: Sequence[dict[str, Any]]) -> Table:
-    """Make the table; `rows` as `measure_bridges` returns them."""
-    made = Table(
-        "bridge", "images, Hz", "MB/s", "age p50, p90, ms", "CPU ms a frame", "node: Hz", "p50, p99, ms"
-    )
-    peer = (
-        "{pictures_hz:.1f}",
-        "{mb_per_s:.1f}",
-        "{age_ms[p50]:.0f}, {age_ms[p90]:.0f}",
-        "{cpu_ms_per_frame:.1f}",
-    )
-    node = "{node_rate_hz:.1f}", "{node_p50_ms:.0f}, {node_p99_ms:.0f}"
-    filled(made, rows[:1], "{bridge}", "", "", "", "", *node)  # nobody listens
-    return filled(made, rows[1:], "{bridge}", *peer, *node)
-
-
-# ---- the node ----------------------------------------------------------------------------------------------
-
-
-def _seen(
-    observer: Subscriber, seconds: float, node: subprocess.Popen[bytes], advance: Advance, what: str
-) -> list[dict[str, Any]]:
-    seen = watched(observer, seconds, node, advance, what)
-    if len(seen) < 3:
-        raise SagsError("too little was heard of the node; measure longer")
-    return seen
+TABLES = (
+    "bridge pictures_hz mb_per_s age_ms.p50 age_ms.p90 cpu_ms_per_frame node_rate_hz node_p50_ms node_p99_ms",
+)
 
 
 def _node_figures(seen: Sequence[dict[str, Any]]) -> dict[str, float]:
@@ -151,34 +131,23 @@ def _frames(observer: Subscriber) -> int:
 
 
 @contextmanager
-def _bridge(case: Case, folder: Path) -> Iterator[tuple[subprocess.Popen[str], Heard]]:
+def _bridge(case: Case, run_dir: Path) -> Iterator[tuple[subprocess.Popen[str], Heard]]:
     """A bridge in its own process, and a peer on a thread."""
-    command = [sys.executable, "-m", "sags_node", "bridge", *case.command, "--json"]
-    process = subprocess.Popen([*command, "--run-dir", str(folder)], stdout=subprocess.PIPE, text=True)
-    stop, heard = threading.Event(), Heard()
-    peer: threading.Thread | None = None
-    try:
-        assert process.stdout is not None
-        said, _, _ = select.select([process.stdout], [], [], STARTING)
-        line = process.stdout.readline() if said else ""
-        if not line:
-            raise SagsError(
-                f"{case.name}: the bridge did not start; try: sags bridge {' '.join(case.command)}"
-            )
-        peer = threading.Thread(target=case.listen, args=(json.loads(line), heard, stop))
+    arguments = ("bridge", *case.command, "--json", "--run-dir", str(run_dir))
+    with sags(*arguments, stdout=subprocess.PIPE, stderr=None) as process:
+        failed = f"{case.name}: the bridge did not start; try: sags bridge {' '.join(case.command)}"
+        said, stop, heard = first_said(process, failed), threading.Event(), Heard()
+        peer = threading.Thread(target=case.listen, args=(said, heard, stop))
         peer.start()
-        deadline = time.monotonic() + STARTING
-        while not heard.ages_ms.get(case.leading):
-            if time.monotonic() > deadline or process.poll() is not None:
-                raise SagsError(f"{case.name}: its peer got nothing within {STARTING:g} s")
-            time.sleep(0.1)
-        heard.ages_ms.clear()
-        heard.count = heard.size = 0
-        yield process, heard
-    finally:
-        stop.set()
-        end(process, grace=STOPPING)
-        if peer is not None:
+        try:
+            failed = f"{case.name}: its peer got nothing within {STARTING:g} s"
+            wait_until(lambda: heard.ages_ms.get(case.leading), process, failed)
+            heard.ages_ms.clear()
+            heard.count = heard.size = 0
+            yield process, heard
+        finally:
+            stop.set()
+            end(process, grace=STOPPING)  # which a peer that waits for a message sees
             peer.join(STOPPING)
 
 

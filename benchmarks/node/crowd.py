@@ -3,7 +3,6 @@
 import json
 import multiprocessing
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,26 +14,22 @@ from typing import Any
 
 import numpy as np
 import zmq
-from rich.table import Table
 
 from benchmarks import Advance
 from benchmarks.node.neighbours import OWN_PORTS, everything, give_way, read_everything
-from benchmarks.node.processes import parent_lives, program
-from benchmarks.tables import filled
+from benchmarks.node.processes import STARTING, own_run_dir, parent_lives, program, sags, wait_until
 from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress, connect
 from sags_node.messaging.received import ReceivedText, TopicName
 from sags_node.messaging.stream import MAX_MESSAGE_BYTES
 from sags_node.messaging.subscriber import Subscriber
-from sags_node.processes import end
 from sags_node.quality.metrics import percentiles
 
 PICTURES = ("left/render/image", "left/render/depth")
 SMALL = ("tf", "anchors", "status")  # what each of the many listens to
 STATUS = TopicName("status", ReceivedText)
+MANY = 20
 WARM_UP = 10.0  # s
-STARTING = 60.0  # s for a node to bind its sockets
-STOPPING = 30.0  # s for it to end
 SLOW = 0.2  # s that the slow subscriber takes for each frame
 PHASE = *OWN_PORTS, "source.loop:=true"
 
@@ -42,7 +37,9 @@ Task = Callable[[Path, float, Event, Connection], None]  # what a subscriber doe
 Work = tuple[Task, float]  # a task and its argument
 
 
-def measure_crowd(launch: Sequence[str], alone: float, crowded: float, many: int, advance: Advance) -> Any:
+def measure_crowd(
+    launch: Sequence[str], alone: float, crowded: float, advance: Advance, many: int = MANY
+) -> Any:
     """Measure a node in its own process: with a quiet observer alone, with a reader of everything, with a
     crowd, and alone again. The reader makes the node compute and send all; the rest is the crowd's cost.
 
@@ -57,44 +54,46 @@ def measure_crowd(launch: Sequence[str], alone: float, crowded: float, many: int
     Raises:
         SagsError: the node does not run.
     """
-    with tempfile.TemporaryDirectory() as folder, node_beside(launch, Path(folder)) as node:
-        with Subscriber([STATUS], run_dir=Path(folder)) as observer:
+    crowd: dict[str, Work] = {"fast": (_take, 0.0), "slow": (_take, SLOW), "dead": (_sleep, 0.0)}
+    crowd[f"{many} more"] = (_listen, float(many))
+    with own_run_dir() as run_dir, node_beside(launch, run_dir) as node:
+        with Subscriber([STATUS], run_dir=run_dir) as observer:
             phases = []
             for name, seconds, work in (
                 ("alone", alone, {}),
                 ("one reader", alone, {"reader": (_read, 0.0)}),
-                ("crowd", crowded, _crowd(many)),
+                ("crowd", crowded, crowd),
                 ("alone again", alone, {}),
             ):
-                with peers_of(Path(folder), work) as stop:
+                with peers_of(run_dir, work) as stop:
                     seen = watched(observer, seconds, node, advance, name)
                     peers = stop()
                 phases.append({"phase": name, **_figures(seen), "peers": peers})
     return {"launch": list(launch), "many": many, "phases": phases}
 
 
+TABLES = (
+    "phase rate_hz.p50 latency_p50_ms latency_p99_ms rss_mb.start rss_mb.end rss_mb_per_minute",
+    "phase messages",
+    "phase rate_hz since_capture_ms.p50 since_sent_ms.p50",
+)
+
+
 @contextmanager
-def node_beside(launch: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a node in its own process, with its files in `folder`."""
-    command = [sys.executable, "-m", "sags_node", "run", *launch, *PHASE, f"publish.run_dir:={folder}"]
+def node_beside(launch: Sequence[str], run_dir: Path) -> Iterator[subprocess.Popen[str]]:
+    """Run a node in its own process, with its files in `run_dir`."""
     with tempfile.TemporaryFile("w+", errors="replace") as errors:  # a pipe that is full would stop the node
-        node = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors)
-        try:
-            deadline = time.monotonic() + STARTING
-            while not any(folder.glob("*.json")):
-                if node.poll() is not None:
-                    errors.seek(0)
-                    raise SagsError(f"the node did not start: {errors.read().strip()}")
-                if time.monotonic() > deadline:
-                    raise SagsError(f"the node did not start within {STARTING:g} s")
-                time.sleep(0.1)
+        with sags("run", *launch, *PHASE, f"publish.run_dir:={run_dir}", stderr=errors) as node:
+            try:
+                wait_until(lambda: any(run_dir.glob("*.json")), node, "the node did not start")
+            except SagsError as error:
+                errors.seek(0)
+                raise SagsError(f"{error}: {errors.read().strip()}") from None
             yield node
-        finally:
-            end(node, grace=STOPPING)
 
 
 def watched(
-    observer: Subscriber, seconds: float, node: subprocess.Popen[bytes], advance: Advance, what: str
+    observer: Subscriber, seconds: float, node: subprocess.Popen[str], advance: Advance, what: str
 ) -> list[dict[str, Any]]:
     """Return the node's own status once a second, without that of the first `WARM_UP` seconds."""
     seen: list[dict[str, Any]] = []
@@ -107,14 +106,9 @@ def watched(
         if newest is not None and passed > WARM_UP:
             seen.append(json.loads(newest.text))
             advance(len(seen), None, what)
+    if len(seen) < 3:
+        raise SagsError("too little was heard of the node; measure longer")
     return seen
-
-
-def _crowd(many: int) -> dict[str, Work]:
-    work: dict[str, Work] = {"fast": (_take, 0.0), "slow": (_take, SLOW), "dead": (_sleep, 0.0)}
-    if many:
-        work[f"{many} more"] = (_listen, float(many))
-    return work
 
 
 @contextmanager
@@ -204,8 +198,6 @@ def _listen(folder: Path, count: float, ending: Event, there: Connection) -> Non
 
 def _figures(seen: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Medians over a phase, and how the memory grew in it."""
-    if len(seen) < 3:
-        raise SagsError("too little was heard of the node; make the phases longer")
     rss = np.array([each["rss_mb"] for each in seen])
     minutes = np.arange(len(rss)) / 60
     return {
@@ -217,25 +209,3 @@ def _figures(seen: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "rss_mb_per_minute": float(np.polyfit(minutes, rss, 1)[0]),
         "connections": seen[-1]["connections"],
     }
-
-
-def table(measured: dict[str, Any]) -> Table:
-    """Make the table; `measured` as `measure_crowd` returns it."""
-    made = Table("phase", "rate, Hz", "latency p50, p99, ms", "RSS, MB", "MB per minute", "others saw")
-    latency, memory = "{latency_p50_ms:.0f}, {latency_p99_ms:.0f}", "{rss_mb[start]:.0f} - {rss_mb[end]:.0f}"
-    rows = [
-        row | {"saw": "\n".join(_seen(name, peer) for name, peer in row["peers"].items())}
-        for row in measured["phases"]
-    ]
-    cells = "{phase}", "{rate_hz[p50]:.1f}", latency, memory, "{rss_mb_per_minute:+.2f}", "{saw}"
-    return filled(made, rows, *cells)
-
-
-def _seen(name: str, peer: dict[str, Any]) -> str:
-    if "rate_hz" in peer:
-        captured, sent = peer["since_capture_ms"], peer["since_sent_ms"]
-        return (
-            f"{name}: {peer['rate_hz']:.1f} Hz, age p50 {captured['p50']:.0f} ms since capture, "
-            f"{sent['p50']:.0f} ms since it was sent"
-        )
-    return f"{name}: {peer['messages']} messages" if "messages" in peer else f"{name}: connected"

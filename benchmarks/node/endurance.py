@@ -7,15 +7,13 @@ or in an order that never repeats. At the end one frame is shown again and again
 import itertools
 import math
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from rich.table import Table
 
 from benchmarks import Advance
-from benchmarks.tables import filled
 from sags_node.errors import SagsError
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import Budget
@@ -36,7 +34,6 @@ TURN = 0.05  # chance per frame that a walk goes the other way
 WATCHED = FrameRequest(left=True, right=True)  # somebody looks at both eyes
 STILL_FRAMES = 100
 CAMERA_NOISE = 2.0  # grey levels, standard deviation
-SIGNIFICANT = 3.0  # standard errors: a smaller slope is no trend
 FIGURES = ("ms_p50", "ms_p99", "psnr", "model_psnr", "gaussians", "nodes", "rss_mb")
 
 
@@ -116,25 +113,24 @@ class _Run:
         )
 
 
+TABLES = (
+    "frames ms_p50 ms_p99 psnr model_psnr gaussians nodes rss_mb still hurried restarts",
+    "slope standard_error",
+    "still: recognised settled cpu_ms moving_cpu_ms cpu_ratio model_psnr",
+)
+
+
 def measure_endurance(
     session: Session, frames: int, per_window: int, order: Order, advance: Advance, seed: int = 0
 ) -> dict[str, Any]:
-    """Play a recording's frames over and over. Ctrl-C ends the measurement with what is known by then.
+    """Play a recording's frames over and over; keys as benchmarks/README.md lists them. Ctrl-C ends it with
+    what is known by then.
 
     Args:
         session: a finite recording that fits into memory.
-        frames: to be played.
-        per_window: frames of one line of the table.
-        order: of the recording's frames: there and back; from the start again after the last one, which is a
-            cut where the recording does not end as it began; or a random walk through time.
-        advance: called with what is going on.
+        order: there and back; from the start again after the last frame, which is a cut where the recording
+            does not end as it began; or a random walk through time.
         seed: of the walk, and of the camera's noise over what stands still.
-
-    Returns:
-        The table, keys as benchmarks/README.md lists them.
-
-    Raises:
-        SagsError: the recording cannot be read, is empty, or is too long to be kept in memory.
     """
     kept = _kept(session)
     run = _Run(session)
@@ -260,43 +256,3 @@ def _stillness(moving: Iterable[_Taken], still: Sequence[_Taken]) -> dict[str, A
         "psnr": float(np.median([each.psnr for each in settled])),
         "model_psnr": float(np.median([each.model_psnr for each in settled])),
     }
-
-
-HEADINGS = (
-    "frames", "ms p50", "ms p99", "PSNR*, dB", "of the model", "Gaussians", "nodes", "RSS, MB", "still",
-    "no depth", "restarts",
-)  # fmt: skip
-
-
-def table(measured: Mapping[str, Any]) -> Table:
-    """Make the table; `measured` as `measure_endurance` returns it."""
-    made = Table(*HEADINGS, title=f"{measured['session']}, {measured['order'].replace('-', ' ')}")
-    quality = "{ms_p50:.1f}", "{ms_p99:.1f}", "{psnr:.2f}", "{model_psnr:.2f}"
-    counts = "{gaussians}", "{nodes}", "{rss_mb:.0f}", "{still}", "{hurried}", "{restarts}"
-    return filled(made, measured["windows"], "{frames}", *quality, *counts)
-
-
-def statement(measured: Mapping[str, Any]) -> str:
-    """Say in words what the table shows, and no more."""
-    lines = ["stopped early"] if measured["interrupted"] else []
-    lines += trends(measured["per_1000_frames"], dict(zip(FIGURES, HEADINGS[1:], strict=False)))
-    still = measured["still"]
-    if still is not None:
-        lines.append(
-            f"one frame again and again: {still['recognised']} of {still['frames']} seen to be still; once "
-            f"settled {still['cpu_ms']:.1f} ms of CPU per frame, {still['cpu_ratio']:.2f} of the "
-            f"{still['moving_cpu_ms']:.1f} ms while it moved; PSNR* of the model {still['model_psnr']:.2f} dB"
-        )
-    return "\n".join(lines)
-
-
-def trends(slopes: Mapping[str, Mapping[str, float] | None], names: Mapping[str, str]) -> list[str]:
-    """Return a line for each slope, which says whether it is more than scatter."""
-    lines = []
-    for figure, found in slopes.items():
-        if found is None:
-            return ["too few windows to tell a trend: at least four are needed"]
-        change, error = found["slope"], found["standard_error"]
-        trend = "" if abs(change) > SIGNIFICANT * error else ", no trend beyond the scatter of the windows"
-        lines.append(f"{names[figure]}: {change:+.3g} ± {error:.2g} per 1000 frames{trend}")
-    return lines

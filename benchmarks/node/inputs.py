@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import Advance
 from benchmarks.node.processes import children, cpu_seconds, parent_lives, program
 from sags_node.client import FrameSender
 from sags_node.config.schema import GeometryConfig, GstSource, PushSource, Ros2Source, RosGraph
@@ -29,9 +30,6 @@ Opener = Callable[[], AbstractContextManager[Source]]  # of a live source of tha
 Send = Callable[[U8, int], object]  # an image as both eyes', and its stamp (ns)
 
 
-# ---- GStreamer -------------------------------------------------------------------------------------------
-
-
 def _camera(height: int) -> str:
     """A black test image, which costs nothing; a moving one takes 18 ms of a core: too slow."""
     return (
@@ -42,9 +40,6 @@ def _camera(height: int) -> str:
 
 TWO = GstSource(launch=f"{_camera(HEIGHT)} ! tee name=t  t. ! left.  t. ! right.")
 OVER_UNDER = GstSource(launch=_camera(2 * HEIGHT), geometry=GeometryConfig(layout="over_under"))
-
-
-# ---- other programs --------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -89,9 +84,6 @@ def _send_always(send: Send) -> None:
         time.sleep(max(0.0, due - time.monotonic()))
 
 
-# ---- measuring -------------------------------------------------------------------------------------------
-
-
 WAYS: dict[str, Opener] = {
     "gst, two branches": partial(open_source, TWO),
     "gst, over-under": partial(open_source, OVER_UNDER),
@@ -100,9 +92,10 @@ WAYS: dict[str, Opener] = {
 }
 
 
-def measure_inputs(
-    seconds: float, only: str | None, progress: Callable[[int, int], None]
-) -> list[dict[str, Any]]:
+TABLES = ("way pairs unequal dropped node_ms sender_ms latency_ms_p50 latency_ms_p99",)
+
+
+def measure_inputs(seconds: float, only: str | None, advance: Advance) -> list[dict[str, Any]]:
     """Measure a row for each way: `way`, `pairs`, `unequal` (pairs of unequal stamps), `dropped` (images
     lost or without a partner); `node_ms`, the CPU time of a pair in the node's process; `sender_ms`, that of
     the process that makes, converts and sends the images; `latency_ms_p50` and `_p99` from the stamp until
@@ -111,7 +104,6 @@ def measure_inputs(
     Args:
         seconds: to measure each way.
         only: measure the ways whose names begin with this; None: all.
-        progress: called with ways done and in all.
 
     Raises:
         UsageError: no way has such a name.
@@ -122,7 +114,7 @@ def measure_inputs(
         raise UsageError(f"--only {only}: the ways are {', '.join(WAYS)}")
     rows = []
     for done, (name, opener) in enumerate(ways.items()):
-        progress(done, len(ways))
+        advance(done, len(ways), name)
         rows.append({"way": name, **_measure(opener, seconds)})
     return rows
 

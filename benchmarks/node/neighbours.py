@@ -5,22 +5,26 @@ A reader stands for another machine, and takes only what the node leaves of the 
 
 import json
 import os
-import select
 import shutil
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from subprocess import DEVNULL, PIPE, Popen
-from typing import Any
 from urllib.request import urlopen
 
 import websockets.sync.client as websockets
 import zmq
 
-from benchmarks.node.processes import parent_lives, program
-from sags_node.errors import SagsError
+from benchmarks.node.processes import (
+    STARTING,
+    STOPPING,
+    first_said,
+    parent_lives,
+    program,
+    sags,
+    wait_until,
+)
 from sags_node.messaging.address import NodeAddress, connect
 from sags_node.messaging.rundir import connection_path
 from sags_node.messaging.stream import MAX_MESSAGE_BYTES
@@ -28,8 +32,6 @@ from sags_node.processes import end
 
 NS = "sags"
 OWN_PORTS = "publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*"
-STARTING = 60.0  # s for a process to be ready
-STOPPING = 5.0  # s for one to end
 BROWSERS = "chromium", "chromium-browser", "google-chrome"
 
 
@@ -49,18 +51,10 @@ def everything(folder: Path) -> Iterator[zmq.Socket[bytes]]:
 @contextmanager
 def overlay(run_dir: Path) -> Iterator[int]:
     """Run the overlay with its mark; gives its process id."""
-    command = [sys.executable, "-m", "sags_node", "overlay", "--run-dir", str(run_dir), "--repin"]
-    process = Popen(command, stdout=DEVNULL, stderr=DEVNULL)
-    try:
-        deadline = time.monotonic() + STARTING
-        while not connection_path(run_dir, "overlay").exists():
-            if process.poll() is not None or time.monotonic() > deadline:
-                raise SagsError("the overlay did not start; see sags overlay --help")
-            time.sleep(0.05)
+    with sags("overlay", "--run-dir", str(run_dir), "--repin", lasts=True) as process:
+        failed = "the overlay did not start; see sags overlay --help"
+        wait_until(connection_path(run_dir, "overlay").exists, process, failed)
         yield process.pid
-        _still_runs(process, "overlay")
-    finally:
-        end(process, grace=STOPPING)
 
 
 @contextmanager
@@ -69,27 +63,17 @@ def viewer(run_dir: Path) -> Iterator[int]:
     browser = find_browser()
     assert browser is not None
     environment = os.environ | {"XDG_RUNTIME_DIR": str(run_dir.parent)}
-    command = [sys.executable, "-m", "sags_node", "view", "--port", "0", "--json"]
-    process = Popen(command, env=environment, stdout=PIPE, stderr=DEVNULL, text=True)
-    shown = None
-    try:
-        assert process.stdout is not None
-        ready, _, _ = select.select([process.stdout], [], [], STARTING)
-        said = process.stdout.readline() if ready else ""  # one line at once, or the process has ended
-        if not said:
-            raise SagsError("the viewer did not start; see sags view --help")
-        url = json.loads(said)["url"]
+    with sags("view", "--port", "0", "--json", lasts=True, env=environment, stdout=PIPE) as process:
+        url = first_said(process, "the viewer did not start; see sags view --help")["url"]
         profile = f"--user-data-dir={run_dir.parent}/browser"
         asked = "--remote-debugging-port=0"  # see `updates_per_s`
         page = [browser, "--headless=new", "--no-sandbox", "--disable-gpu", asked, profile, url]
         # Not `nice`: the process of Chromium that draws takes a high priority again, where it may.
         shown = Popen(["chrt", "--idle", "0", *page], stdout=DEVNULL, stderr=DEVNULL)
-        yield process.pid
-        _still_runs(process, "viewer")
-    finally:
-        if shown is not None:
+        try:
+            yield process.pid
+        finally:
             end(shown, grace=STOPPING)
-        end(process, grace=STOPPING)
 
 
 def updates_per_s(run_dir: Path) -> float:
@@ -103,12 +87,6 @@ def updates_per_s(run_dir: Path) -> float:
     with websockets.connect(page["webSocketDebuggerUrl"], proxy=None) as browser:
         browser.send(json.dumps({"id": 1, "method": "Runtime.evaluate", "params": ask}))
         return float(json.loads(browser.recv(timeout=STARTING))["result"]["result"]["value"])
-
-
-def _still_runs(process: Popen[Any], name: str) -> None:
-    """Raise if a neighbour has ended: its row would say that it costs nothing."""
-    if process.poll() is not None:
-        raise SagsError(f"the {name} ended before its time, exit code {process.returncode}")
 
 
 def reader(run_dir: Path) -> AbstractContextManager[None]:

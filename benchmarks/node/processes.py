@@ -1,14 +1,22 @@
 """Processes: what they cost, which this one has started, and how to run work in another."""
 
+import json
 import multiprocessing
 import os
+import select
+import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from subprocess import DEVNULL, Popen
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
-STOPPING = 5.0  # s for a process to end
+from sags_node.errors import SagsError
+from sags_node.processes import end
+
+STARTING, STOPPING = 60.0, 30.0  # s for a process to be ready, and to end
 TICKS = os.sysconf("SC_CLK_TCK")  # clock ticks per second of CPU time
 
 
@@ -66,5 +74,50 @@ def program(work: Callable[..., None], *arguments: Any) -> Iterator[None]:
         yield
     finally:
         process.terminate()
-        process.join(STOPPING)
+        process.join(5.0)
         process.kill()
+
+
+@contextmanager
+def sags(*arguments: str, lasts: bool = False, **more: Any) -> Iterator[Popen[str]]:
+    """Run a command of sags in another process until the block ends.
+
+    Raises:
+        SagsError: it has ended before, though it `lasts`: its figures would say that it costs nothing.
+    """
+    command = [sys.executable, "-m", "sags_node", *arguments]
+    process = Popen(command, text=True, **{"stdout": DEVNULL, "stderr": DEVNULL, **more})
+    try:
+        yield process
+        if lasts and process.poll() is not None:
+            raise SagsError(f"sags {arguments[0]} ended before its time, exit code {process.returncode}")
+    finally:
+        end(process, grace=STOPPING)
+
+
+def first_said(process: Popen[str], failed: str) -> dict[str, Any]:
+    """Return the JSON that a process prints when it is ready.
+
+    Raises:
+        SagsError: `failed`; it ends, or prints nothing in time.
+    """
+    assert process.stdout is not None
+    ready, _, _ = select.select([process.stdout], [], [], STARTING)
+    said = process.stdout.readline() if ready else ""  # one line at once, or the process has ended
+    if not said:
+        raise SagsError(failed)
+    found: dict[str, Any] = json.loads(said)
+    return found
+
+
+def wait_until(ready: Callable[[], object], process: Popen[str], failed: str) -> None:
+    """Wait for what a process should do.
+
+    Raises:
+        SagsError: `failed`; it ends, or does not do it in time.
+    """
+    deadline = time.monotonic() + STARTING
+    while not ready():
+        if process.poll() is not None or time.monotonic() > deadline:
+            raise SagsError(failed)
+        time.sleep(0.05)

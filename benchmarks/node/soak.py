@@ -9,11 +9,10 @@ import os
 import random
 import shutil
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
@@ -21,13 +20,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from benchmarks import Advance
 from benchmarks.node import neighbours
 from benchmarks.node.crowd import is_over, node_beside, peers_of
-from benchmarks.node.endurance import SIGNIFICANT, slope, trends
-from benchmarks.node.processes import listed, own_run_dir
+from benchmarks.node.endurance import slope
+from benchmarks.node.processes import STARTING, listed, own_run_dir, sags
 from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.freezes import Freezes
@@ -35,7 +33,7 @@ from sags_node.messaging.received import ReceivedImage, TopicName
 from sags_node.messaging.stream import listen_to
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.wire import Message, Meta
-from sags_node.processes import end, resident_mb
+from sags_node.processes import resident_mb
 from sags_node.quality.metrics import psnr
 from sags_node.tools.evaluation.provenance import machine_name
 
@@ -55,12 +53,14 @@ RECORDING = 60.0  # s of one recording
 SILENCE = 30.0  # s without a frame: the node hangs
 NODE = ("frames_per_s", "latency_p50_ms", "latency_p99_ms", "psnr", "rss_mb", "descriptors", "threads")
 FIGURES = (*NODE, "overlay_mb", "viewer_mb")
-HEADINGS = (
-    "frames/s", "latency p50, ms", "p99, ms", "PSNR*, dB", "RSS, MB", "descriptors", "threads", "overlay, MB",
-    "viewer, MB",
-)  # fmt: skip
-
-
+TABLES = (
+    f"frames {' '.join(FIGURES)}",
+    "slope standard_error",
+    "frames published dropped missed latency_ms.p50 latency_ms.p99 latency_ms.p99.9 latency_ms.max"
+    " freezes.count freezes.seconds visits.visits visits.pictures",
+    "recordings failed messages dropped lost",
+)
+SIGNIFICANT = 3.0  # standard errors: a smaller slope is no trend
 WORSE_WHEN_LESS = ("frames_per_s", "psnr")  # of `FIGURES`; the others are worse when they grow
 AN_HOUR = 108_000  # frames of the camera
 TOLERATED = 0.1  # change per hour, as a share of a figure's mean
@@ -112,20 +112,8 @@ class _Heard:
 
 
 def measure_soak(launch: Sequence[str], frames: int, per_window: int, advance: Advance) -> dict[str, Any]:
-    """Run a node live for `frames` frames of its camera. Ctrl-C ends it with what is known by then.
-
-    Args:
-        launch: launch file and overrides of the node.
-        frames: of the camera after the first seconds, published or left out.
-        per_window: of them, for one line of the table.
-        advance: called with what is going on.
-
-    Returns:
-        The table, keys as benchmarks/README.md lists them.
-
-    Raises:
-        SagsError: the node does not run, or publishes nothing any more.
-    """
+    """Run a node live for `frames` frames of its camera, published or left out, after the first seconds; keys
+    as benchmarks/README.md lists them. Ctrl-C ends it with what is known by then."""
     heard, windows = _Heard(), list[Window]()
     interrupted = False
     with own_run_dir() as run_dir, ExitStack() as stack:
@@ -166,7 +154,7 @@ def measure_soak(launch: Sequence[str], frames: int, per_window: int, advance: A
     }
 
 
-def _frames(run_dir: Path, node: subprocess.Popen[bytes], heard: _Heard) -> Iterator[None]:
+def _frames(run_dir: Path, node: subprocess.Popen[str], heard: _Heard) -> Iterator[None]:
     """Add each published frame after the first seconds to `heard`."""
     begun = last = time.monotonic()
     messages = listen_to(NodeAddress(neighbours.NS, run_dir=run_dir), (EACH_FRAME,), None, HIGH_WATER)
@@ -269,13 +257,15 @@ def _come_and_go(run_dir: Path, ending: Event, chance: random.Random, counts: di
 def _recordings(run_dir: Path) -> Iterator[Callable[[], dict[str, int]]]:
     """Make one recording after another, each removed once closed. The function given ends and counts them."""
     counts = {"recordings": 0, "failed": 0, "messages": 0, "dropped": 0, "lost": 0}
-    ending = threading.Event()
-    thread = threading.Thread(target=_record, args=(run_dir, ending, counts), daemon=True)
+    ending, running = threading.Event(), list[subprocess.Popen[str]]()
+    thread = threading.Thread(target=_record, args=(run_dir, ending, running, counts), daemon=True)
     thread.start()
 
     def stop() -> dict[str, int]:
         ending.set()
-        thread.join(neighbours.STARTING)
+        for recorder in running:
+            recorder.terminate()
+        thread.join(STARTING)
         return counts
 
     try:
@@ -284,27 +274,26 @@ def _recordings(run_dir: Path) -> Iterator[Callable[[], dict[str, int]]]:
         stop()
 
 
-def _record(run_dir: Path, ending: threading.Event, counts: dict[str, int]) -> None:
-    environment = os.environ | {"XDG_RUNTIME_DIR": str(run_dir.parent)}
+def _record(
+    run_dir: Path, ending: threading.Event, running: list[subprocess.Popen[str]], counts: dict[str, int]
+) -> None:
     folder = run_dir.parent / "recording"
     topics = [word for name in RECORDED for word in ("--topics", name)]
-    command = [sys.executable, "-m", "sags_node", "bag", "record", "-o", str(folder), *topics]
+    command = ("bag", "record", "-o", str(folder), *topics, "--compression", "jpeg", "--json")
+    environment = os.environ | {"XDG_RUNTIME_DIR": str(run_dir.parent)}
     while not ending.is_set():
-        recorder = subprocess.Popen(
-            [*command, "--compression", "jpeg", "--seconds", str(RECORDING), "--json"],
-            env=environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-        )
-        try:
-            said = _said(recorder, ending)
-        finally:
-            end(recorder, grace=neighbours.STOPPING)
-        lines = said.splitlines()
-        if recorder.returncode == 0 and lines:
+        said = ""
+        with sags(
+            *command, "--seconds", f"{RECORDING:g}", env=environment, stdout=subprocess.PIPE
+        ) as recorder:
+            running[:] = [recorder]
+            if ending.is_set():
+                recorder.terminate()
+            with suppress(subprocess.TimeoutExpired):
+                said, _ = recorder.communicate(timeout=STARTING + RECORDING)
+        if recorder.returncode == 0 and said:
             counts["recordings"] += 1
-            summary: Mapping[str, int] = json.loads(lines[-1])
+            summary: Mapping[str, int] = json.loads(said.splitlines()[-1])
             for key in ("messages", "dropped", "lost"):
                 counts[key] += summary[key]
         else:
@@ -312,29 +301,8 @@ def _record(run_dir: Path, ending: threading.Event, counts: dict[str, int]) -> N
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _said(recorder: subprocess.Popen[str], ending: threading.Event) -> str:
-    """Return all that the recorder prints. When `ending` is set, it is asked once to end."""
-    deadline = time.monotonic() + neighbours.STARTING + RECORDING
-    asked = False
-    while time.monotonic() < deadline:
-        if ending.is_set() and not asked:
-            recorder.terminate()
-            asked = True
-        try:
-            return recorder.communicate(timeout=0.5)[0]
-        except subprocess.TimeoutExpired:
-            continue
-    return ""
-
-
 def worsening(measured: Mapping[str, Any]) -> list[str]:
-    """Return the figures that get worse beyond their scatter, by more than `TOLERATED`.
-
-    Args:
-        measured: as `measure_soak` returns it.
-
-    Returns:
-        Names of `FIGURES`.
+    """Return the names of `FIGURES` that get worse beyond their scatter, by more than `TOLERATED`.
 
     Raises:
         SagsError: there are too few windows to tell.
@@ -348,42 +316,3 @@ def worsening(measured: Mapping[str, Any]) -> list[str]:
         if worse > SIGNIFICANT * trend["standard_error"] and worse * AN_HOUR / 1000 > TOLERATED * mean:
             found.append(figure)
     return found
-
-
-# ---- what is said ----------------------------------------------------------------------------------------
-
-
-def table(measured: Mapping[str, Any]) -> Table:
-    """Make the table; `measured` as `measure_soak` returns it."""
-    title = (
-        f"{measured['frames']} frames of the camera in {measured['seconds']:.0f} s, "
-        f"{measured['published']} published"
-    )
-    made = Table("frames", *HEADINGS, title=title)
-    for row in measured["windows"]:
-        made.add_row(str(row["frames"]), *(_figure(row[figure]) for figure in FIGURES))
-    return made
-
-
-def _figure(value: float | None) -> str:
-    return f"{value:.1f}" if isinstance(value, float) else str(value)
-
-
-def statement(measured: Mapping[str, Any]) -> str:
-    """Say in words what the table shows, and no more."""
-    lines = ["stopped early"] if measured["interrupted"] else []
-    latency, freezes = measured["latency_ms"], measured["freezes"]
-    lines.append(
-        f"latency p50 {latency['p50']:.0f} ms, p99 {latency['p99']:.0f}, p99.9 {latency['p99.9']:.0f}, "
-        f"at most {latency['max']:.0f}; {freezes['count']} freezes, {freezes['seconds']:.1f} s together; "
-        f"{measured['dropped']} frames left out, {measured['missed']} messages missed"
-    )
-    visits, recordings = measured["visits"], measured["recordings"]
-    lines.append(
-        f"{visits['visits']} visits of subscribers took {visits['pictures']} images; "
-        f"{recordings['recordings']} recordings, {recordings['failed']} failed, of "
-        f"{recordings['messages']} messages {recordings['dropped']} dropped and {recordings['lost']} lost"
-    )
-    return "\n".join(
-        [*lines, *trends(measured["per_1000_frames"], dict(zip(FIGURES, HEADINGS, strict=True)))]
-    )

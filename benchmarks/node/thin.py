@@ -1,11 +1,11 @@
 """`benchmarks thin`: what thin images cost to make and to read, and what they take of a link."""
 
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from benchmarks import Advance
 from sags_node.errors import SagsError
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
@@ -24,11 +24,10 @@ NAMES = tuple(
         *("render/depth/png", "render/depth_confidence/png", "tissue_mask/png"),
     )
 )
+TABLES = ("topic make_cpu_ms decode_cpu_ms kB Mbit_per_s_at_30_Hz",)
 
 
-def measure_thin(
-    session: Session, frames: int, advance: Callable[[int, int | None, str], None]
-) -> list[dict[str, Any]]:
+def measure_thin(session: Session, frames: int, advance: Advance) -> list[dict[str, Any]]:
     """Measure a row for each thin image: CPU time to make and to decode it, and its size, mean of `frames`.
 
     Raises:

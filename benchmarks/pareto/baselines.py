@@ -12,7 +12,6 @@ import numpy as np
 
 from benchmarks.quality.sgbm import JudgedSGBM
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
-from sags_node.errors import UsageError
 from sags_node.pipeline.session import Session
 from sags_node.quality import metrics
 from sags_node.sources.source import open_source
@@ -23,6 +22,7 @@ from sags_node.tools.evaluation.warp import right_figures, right_pixels
 from sags_node.types import Bool
 from sags_node.vision.rectify import Rectifier
 
+RESULTS = Path("benchmarks/results")
 SGBM_SCALES = (1, 2)
 NO_RIGHT = {"warp_psnr": float("nan"), "model_psnr": float("nan"), "coverage": 0.0}  # no warp is known
 
@@ -41,10 +41,6 @@ def measured_baselines(
 
     Returns:
         A row for each baseline; none for a recording without a right eye.
-
-    Raises:
-        UsageError: the images are too small to match at `SGBM_SCALES`.
-        SagsError: the recording cannot be read again.
     """
     config = session.config
     rectifier = Rectifier(session.rig, *size)
@@ -120,27 +116,19 @@ def baselines_of_run(run: Row) -> list[Row]:
     return rows
 
 
-def read_fits(files: Sequence[Path]) -> list[Row]:
-    """Read offline fits: rows from the figures that `sags fit` wrote, each with the session it was made of.
-
-    Raises:
-        UsageError: a file cannot be read or holds something else.
-    """
+def known_fits(session: str) -> list[Row]:
+    """Return rows of the offline fits of this session among the results of `sags fit`."""
     rows = []
-    for file in files:
-        try:
-            figures = json.loads(file.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise UsageError(f"cannot read {file} as figures of a fit: {error}") from None
-        if not isinstance(figures, dict) or not {"session", "seconds", "heldout"} <= figures.keys():
-            raise UsageError(f"{file} holds no figures of a fit; give the figures.json that sags fit wrote")
-        row = {
-            "session": figures["session"],
-            "name": f"offline fit, {figures['seconds']:.0f} s in all",
-            "heldout": figures["heldout"],
-            "depth": figures.get("depth"),
-            "gaussians": {"mean": figures.get("gaussians")},
-            "file": str(file),
-        }
-        rows.append(row)
+    for file in sorted(RESULTS.glob("fit_*.json")):
+        figures = json.loads(file.read_text(encoding="utf-8"))
+        if figures["session"] == session:
+            row = {
+                "session": session,
+                "name": f"offline fit, {figures['seconds']:.0f} s in all",
+                "heldout": figures["heldout"],
+                "depth": figures.get("depth"),
+                "gaussians": {"mean": figures.get("gaussians")},
+                "file": str(file),
+            }
+            rows.append(row)
     return rows

@@ -10,7 +10,7 @@ from typing import Any
 
 from benchmarks import Advance
 from benchmarks.node.hosts import measure_hosts
-from benchmarks.pareto.baselines import baselines_of_run, measured_baselines
+from benchmarks.pareto.baselines import baselines_of_run, known_fits, measured_baselines
 from benchmarks.pareto.settings import (
     HOSTS,
     RUNG_PART,
@@ -44,29 +44,31 @@ KEPT = (
 Row = dict[str, Any]
 
 
+TABLES = (
+    "session why_default",
+    "settings: session name frame_ms.p50 frame_ms.p99 cpu_ms.p50 online_at_full_size.psnr predict.psnr"
+    " heldout.psnr novel.psnr depth.median_mm depth.coverage track.median_mm gaussians.mean non_dominated",
+    "baselines: session frame_ms.p50 predict.psnr heldout.psnr novel.psnr depth.median_mm depth.coverage"
+    " name",
+    "skips: session on.online.psnr off.online.psnr online_db depth_mm saved_ms rule",
+    "hosts: session share_after_first_second first_render_ms frame_ms.p50 latency_ms.p50 latency_ms.p99 size"
+    " online_at_full_size.psnr gaussians.mean updates_per_s name",
+)
+
+
 def measure_pareto(
     launches: Sequence[str | None],
     overrides: Sequence[str],
     sweep: Sweep,
-    fits: Sequence[Row],
     advance: Advance,
 ) -> Row:
-    """Play every setting over every recording and measure it.
+    """Play every setting over every recording and measure it; keys as benchmarks/README.md lists them.
 
     Args:
         launches: launch files or session folders; None: the built-in phantom.
         overrides: `key:=value`, for all of them.
-        fits: of any sessions, `baselines.read_fits`.
-        advance: called with what is going on.
-
-    Returns:
-        The table, keys as benchmarks/README.md lists them.
-
-    Raises:
-        UsageError: a wrong key, value or path.
-        SagsError: a recording cannot be used.
     """
-    sessions = [_Comparison(launch, overrides, sweep, advance).measure(fits) for launch in launches]
+    sessions = [_Comparison(launch, overrides, sweep, advance).measure() for launch in launches]
     return {
         "machine": machine_name(),
         "overrides": list(overrides),
@@ -115,7 +117,7 @@ class _Comparison:
         self._size = self._session.working_size
         warm_up(self._session.config)
 
-    def measure(self, fits: Sequence[Row]) -> Row:
+    def measure(self) -> Row:
         session, parts = self._session, self._sweep.parts
         timed = time_settings(session.config, self._size, parts)
         timed += rung_settings() if RUNG_PART in parts else []
@@ -134,7 +136,7 @@ class _Comparison:
                     compared = receipt
                     baselines = baselines_of_run(runs[setting][0])
                     baselines += measured_baselines(played, run, self._size, self._sweep.options, progress)
-        baselines += [fit for fit in fits if fit["session"] == session.name]
+        baselines += known_fits(session.name)
         rows = [_middle(runs[setting]) for setting in timed]
         for row, best in zip(rows, non_dominated([_place(row) for row in rows]), strict=True):
             row["non_dominated"] = best
@@ -236,9 +238,6 @@ def online_at(
 ) -> dict[str, Any]:
     """Return the figures `online` of a finished run, with its Gaussians drawn at `size` (width, height, px)
     and compared with images of that size.
-
-    Raises:
-        SagsError: the recording cannot be read again.
     """
     config = session.config
     rectifier = Rectifier(session.rig, *size)

@@ -12,10 +12,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from rich.table import Table
 
 from benchmarks import Advance
-from benchmarks.tables import filled
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import SagsError, UsageError
@@ -23,8 +21,6 @@ from sags_node.geometry import scale_intrinsics
 from sags_node.kernels.threads import configure_threads
 from sags_node.pipeline.session import Session
 from sags_node.quality import metrics
-from sags_node.terminal.text import table
-from sags_node.tools.evaluation.lpips import Lpips
 from sags_node.tools.evaluation.measure import MeasureOptions
 from sags_node.tools.evaluation.provenance import machine_name
 from sags_node.tools.evaluation.receipt import Receipt
@@ -69,39 +65,28 @@ def measure_ablation(
     session: Session,
     warm_up: int,
     iterations: int,
-    options: MeasureOptions,
     advance: Advance,
-    seeds: int = 3,
-    only: Sequence[str] = (),
-    changes: Sequence[str] = (),
+    seeds: int,
+    only: Sequence[str],
+    changes: Sequence[str],
 ) -> dict[str, Any]:
-    """Fit and measure every variant.
+    """Fit and measure every variant; keys as benchmarks/README.md lists them.
 
     Args:
-        session: a recording.
         warm_up: iterations of each fit without deformation; only of the paper's schedule.
         iterations: of each fit, with deformation.
-        options: hold-out and LPIPS weights.
-        advance: called with what is going on.
         seeds: how many fits of each variant.
         only: names of variants; none: all.
         changes: of the settings of every variant, as `with_changes` takes them.
-
-    Returns:
-        The table, keys as benchmarks/README.md lists them.
-
-    Raises:
-        UsageError: there is no such variant, or no such setting.
-        SagsError: the recording cannot be read or is too short, or no frame has depth enough.
     """
     unknown = [name for name in only if name not in VARIANTS]
     if unknown:
         raise UsageError(f"there is no variant {', '.join(unknown)}; choose of {', '.join(VARIANTS)}")
-    lpips = None if options.lpips_weights is None else Lpips(options.lpips_weights)
     configure_threads(session.config.engine.threads)
     count = session.source.frame_count
-    receipt = Receipt(session.rig, session.working_size, options.lpips_weights)
-    clip = read_clip(session, options.holds_out, lambda done: advance(done, count, "reading"), receipt.add)
+    receipt = Receipt(session.rig, session.working_size, None)
+    holds_out = MeasureOptions().holds_out
+    clip = read_clip(session, holds_out, lambda done: advance(done, count, "reading"), receipt.add)
     known, ahead = _split(clip)
     chosen = {
         name: replace(
@@ -116,7 +101,7 @@ def measure_ablation(
     for seed in range(seeds):
         for name, settings in chosen.items():
             fit, started = _fitted(known, replace(settings, seed=seed), f"{name}, seed {seed}", advance)
-            row = _measured(fit, ahead, session.config.played_segments, lpips)
+            row = _measured(fit, ahead, session.config.played_segments)
             row["ms_per_iteration"] = round(1e3 * (fit.seconds - started) / fit.total, 1)
             variants[name].append(row)
     return {
@@ -148,17 +133,15 @@ def _fitted(clip: Clip, settings: FitSettings, name: str, advance: Advance) -> t
     return fit, started
 
 
-def _measured(
-    fit: Fit, ahead: Sequence[ClipFrame], segments: Mapping[str, tuple[int, int]], lpips: Lpips | None
-) -> Row:
+def _measured(fit: Fit, ahead: Sequence[ClipFrame], segments: Mapping[str, tuple[int, int]]) -> Row:
     known, places = _by_time(fit.clip), dict(segments)
     some = fit.clip.train[:: max(1, len(fit.clip.train) // max(1, len(fit.clip.test)))]
     return {
-        "heldout": score(fit, fit.clip.test, places, lpips),
+        "heldout": score(fit, fit.clip.test, places),
         "train": score(fit, some, places),
         "between": score_between(fit, fit.clip.test, places),
         "smaller": {name: _smaller(fit, fit.clip.test, factor) for name, factor in SMALLER.items()},
-        "ahead": score(fit, ahead, {}, lpips),
+        "ahead": score(fit, ahead, {}),
         "depth": score_depth(fit, known, places),
         "track": score_tracks(fit, known),
         "track_with_ahead": score_tracks(fit, [known[0], *ahead]),
@@ -191,6 +174,11 @@ def _smaller(fit: Fit, frames: Iterable[ClipFrame], factor: int) -> float:
     return round(float(np.nanmean(found)), 4)
 
 
+TABLES = (
+    "heldout.psnr heldout.ssim train.psnr smaller.half smaller.quarter ahead.psnr track.median_mm gaussians"
+    " ms_per_iteration",
+    "train.mean half.mean quarter.mean heldout.lowest heldout.highest heldout.mean paper_db",
+)
 FIGURES: Mapping[str, Callable[[Row], float]] = {
     "heldout": lambda row: float(row["heldout"]["psnr"]),
     "train": lambda row: float(row["train"]["psnr"]),
@@ -228,34 +216,6 @@ def _split(clip: Clip) -> tuple[Clip, list[ClipFrame]]:
         raise SagsError(
             f"there are {len(frames)} frames; without the last {AHEAD}, which are for looking ahead, "
             f"{len(known.train)} are left to learn from and {len(known.test)} to test on, and each needs "
-            "one: play more (source.frames, source.start) or change --hold-out"
+            "one: play more (source.frames, source.start)"
         )
     return known, frames[-AHEAD:]
-
-
-def tables(measured: dict[str, Any]) -> list[Table]:
-    """Make two tables: a row for each variant, mean and half the range over seeds; and one for each part."""
-    headings = (
-        "", "PSNR* held-out", "train", "half size", "quarter", "SSIM", "ahead", "track mm", "N", "ms/it",
-    )  # fmt: skip
-    made = table(*headings)
-    for name, rows in measured["variants"].items():
-        columns: list[list[float | None]] = [[figure(row) for row in rows] for figure in FIGURES.values()]
-        columns += [[row["heldout"]["ssim"] for row in rows], [row["ahead"]["psnr"] for row in rows]]
-        columns += [[(row["track"] or {}).get("median_mm") for row in rows]]
-        columns += [[row[key] for row in rows] for key in ("gaussians", "ms_per_iteration")]
-        made.add_row(name, *(_spread(column) for column in columns))
-    parts = table("dB", "held-out", "lowest to highest", "train", "half size", "quarter", "paper")
-    cells = ["{heldout[mean]:+.2f}", "{heldout[lowest]:+.2f} to {heldout[highest]:+.2f}"]
-    cells += [f"{{{key}[mean]:+.2f}}" for key in ("train", "half", "quarter")]
-    for name, part in measured["parts"].items():
-        filled(parts, [part], name, *cells, "{paper_db:+.2f}", unknown="–")
-    return [made, parts]
-
-
-def _spread(values: Sequence[float | None]) -> str:
-    known = [value for value in values if value is not None]
-    if not known:
-        return "–"
-    half = (max(known) - min(known)) / 2
-    return f"{np.mean(known):.4g}" + (f" ± {half:.2g}" if half > 0 else "")

@@ -5,18 +5,16 @@ nothing. Four models of one instant of the phantom are trained by the mapper, ea
 filters, and drawn where nothing was trained, against the ray-cast truth.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import cv2
 import numpy as np
-from rich.table import Table
 
 from benchmarks import Advance
 from benchmarks.quality.alias_truth import AliasTruth, Shot
-from benchmarks.tables import filled
 from sags_node.config.schema import PhantomSource
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
@@ -102,6 +100,14 @@ class Measured:
     table: dict[str, Any]
     truth: AliasTruth
     models: Mapping[str, Trained]
+
+
+TABLES = (
+    "gain_db_quarter gain_db_size_4 gain_db_distance_4 gain_db_distance_half",
+    f"{' '.join(VARIANTS)} factor",
+    " ".join(f"{name}.{part}" for name in VARIANTS for part in ("picture", "error")) + " px_per_frame",
+    "view no yes",
+)
 
 
 def measure_alias(settings: Settings, advance: Advance) -> Measured:
@@ -193,25 +199,6 @@ def _requested_view(model: Trained, truth: AliasTruth) -> list[dict[str, Any]]:
         yes, no = (psnr(each.draw(shot.camera), shot.image, shot.counted) for each in (joined, model))
         rows.append({"view": view, "yes": yes, "no": no})
     return rows
-
-
-def tables(measured: Mapping[str, Any]) -> Iterator[Table]:
-    """Make the tables; `measured` as `measure_alias` returns it."""
-    yield _by_factor("PSNR, dB, at an image size of", measured["psnr_at_size"], ".2f")
-    yield _by_factor("PSNR, dB, from a distance of", measured["psnr_at_distance"], ".2f")
-    changes = measured["thin_vessel_brightness_change"]
-    yield _by_factor("brightness of thin vessels, at an image size of", changes, "+.2%")
-    flicker = measured["flicker"]
-    for part in ("picture", "error"):
-        row = {"factor": flicker["size"]} | {name: flicker[name][part] for name in VARIANTS}
-        yield _by_factor(f"flicker of the {part} against the truth's, at a size of", [row], ".2f")
-    joined = Table("view from nearer by", "PSNR, dB", "its camera in the 3D filter")
-    yield filled(joined, measured["requested_view_in_filter"], "{view}", "{no:.2f}", "{yes:.2f}")
-
-
-def _by_factor(title: str, rows: list[dict[str, Any]], shown: str) -> Table:
-    made = Table(title, *(name.replace("_", " ") for name in VARIANTS))
-    return filled(made, rows, "x {factor:g}", *(f"{{{name}:{shown}}}" for name in VARIANTS))
 
 
 def picture(truth: AliasTruth, models: Mapping[str, Trained]) -> bytes:

@@ -11,12 +11,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from benchmarks import Advance
 from benchmarks.quality.depth import rounded
 from benchmarks.quality.registration import SIZE, part, shown_to_node
-from benchmarks.tables import filled
 from sags_node.clients.overlay.draw import Body
 from sags_node.clients.overlay.frame import Anchor, TissueFrame
 from sags_node.clients.overlay.held import HeldObject
@@ -57,6 +55,12 @@ class Own(Pinner):
         points = np.array([[request[axis] for axis in "xyz"] for request in requests])
         done.set_result([self._pipeline.anchors.add_point(point, *frame) for point in points])
         return done
+
+
+TABLES = (
+    "below_mm all_rigid.median_mm all_rigid.p90_mm all_bent.median_mm all_bent.p90_mm moved_rigid.median_mm"
+    " moved_rigid.p90_mm moved_bent.median_mm moved_bent.p90_mm worse_mm",
+)
 
 
 def measure_deform(seeds: int, advance: Advance) -> dict[str, Any]:
@@ -157,11 +161,3 @@ def _half_space(ways: F64) -> F64:
         for z in BELOW
     ]
     return np.stack(found)[:, :rows, :cols].reshape(len(BELOW), -1, 3)
-
-
-def tables(measured: dict[str, Any]) -> list[Table]:
-    """Make the tables for people."""
-    columns = [f"{which}_{name}" for which in ("all", "moved") for name in MODES]
-    errors = Table("below, mm", *columns, "worse, mm", title="median, nine of ten, mm")
-    cells = [f"{{{name}[median_mm]}}, {{{name}[p90_mm]}}" for name in columns]
-    return [filled(errors, measured["rows"], "{below_mm}", *cells, "{worse_mm}")]

@@ -2,7 +2,7 @@
 
 import statistics
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -50,7 +50,7 @@ FAULTS: dict[str, tuple[float, ...]] = {  # name in `PhantomScene` -> levels
 Matcher = Callable[[RectifiedPair, Bool], tuple[F32, F32]]  # depth (m, 0 unknown) and confidence, [H, W]
 
 
-def network_matcher(file: Path, config: StereoConfig, camera: Camera, baseline: float) -> Matcher:
+def _network_matcher(file: Path, config: StereoConfig, camera: Camera, baseline: float) -> Matcher:
     """Return the stage with a network, as `vision.onnx` sets it up, without its fallback.
 
     Raises:
@@ -88,7 +88,7 @@ def make_matchers(
     for scale in PLAIN_SCALES:
         matchers[f"plain SGBM, scale {scale}"] = PlainSGBM(config, camera, baseline, scale)
     if network is not None:
-        matchers[f"network {network.name}"] = network_matcher(network, config, camera, baseline)
+        matchers[f"network {network.name}"] = _network_matcher(network, config, camera, baseline)
     return matchers
 
 
@@ -111,14 +111,16 @@ class Tally:
         self.confidences.append(confidence[given])
         self.shared.append(shared[given])
 
-    def figures(self) -> dict[str, Any]:
+    def errors(self) -> dict[str, Any]:
         errors, shared = np.concatenate(self.errors_mm), np.concatenate(self.shared)
         return {
             **error_figures(errors),
             "coverage": rounded(len(errors) / self.wanted) if self.wanted else None,
             "where_configured_knows": error_figures(errors[shared]),
-            "ms": rounded(statistics.median(self.times_ms)) if self.times_ms else None,
         }
+
+    def figures(self) -> dict[str, Any]:
+        return self.errors() | {"ms": rounded(statistics.median(self.times_ms)) if self.times_ms else None}
 
     def by_confidence(self) -> list[dict[str, Any]]:
         return by_confidence(np.concatenate(self.errors_mm), np.concatenate(self.confidences))
@@ -190,33 +192,17 @@ class Comparison:
         return [{"name": name, **tally.figures()} for name, tally in self.tallies.items()]
 
 
-class Regions:
-    """Errors by region of the image (`regions_of`), of the stage as configured and of the drawn model."""
-
-    def __init__(self) -> None:
-        self._tallies: dict[str, tuple[Tally, Tally]] = {}
-
-    def add(self, stage: F32, drawn: F32, truth: F32, masks: Mapping[str, Bool]) -> None:
-        for name, mask in masks.items():
-            tallies = self._tallies.setdefault(name, (Tally(), Tally()))
-            for tally, depth in zip(tallies, (stage, drawn), strict=True):
-                tally.add(depth, np.ones_like(depth), truth, mask, stage > 0)
-
-    def rows(self) -> list[dict[str, Any]]:
-        return [
-            {"region": name, "stage": _without_time(stage), "drawn": _without_time(drawn)}
-            for name, (stage, drawn) in self._tallies.items()
-        ]
+TABLES = (
+    "fault level white name median_mm p90_mm bias_mm coverage nearest_median_mm nearest_p90_mm"
+    " where_configured_knows.median_mm where_configured_knows.p90_mm ms",
+    "share median_mm p90_mm bias_mm above up_to",
+    "region stage.median_mm stage.p90_mm stage.coverage drawn.median_mm drawn.p90_mm drawn.coverage"
+    " drawn.where_configured_knows.bias_mm",
+)
 
 
-def _without_time(tally: Tally) -> dict[str, Any]:
-    return {key: value for key, value in tally.figures().items() if key != "ms"}
-
-
-def measure_recording(
-    session: Session, advance: Advance, every: int = EVERY, network: Path | None = None
-) -> dict[str, Any]:
-    """Compare depth on tissue with a recording's reference depth, in at most one of `every` frames.
+def measure_recording(session: Session, advance: Advance, network: Path | None = None) -> dict[str, Any]:
+    """Compare depth on tissue with a recording's reference depth, in at most one of `EVERY` frames.
 
     The whole recording is played with one step of the mapper a frame, so that the depth of the drawn model is
     measured, too.
@@ -230,7 +216,7 @@ def measure_recording(
     pipeline, budget = Pipeline(config, session.rig), StepBudget(1)
     camera, size = pipeline.rectifier.camera, session.working_size
     matchers = make_matchers(config.vision.stereo, camera, pipeline.rectifier.baseline, network)
-    comparison, regions = Comparison(matchers), Regions()
+    comparison, regions = Comparison(matchers), dict[str, dict[str, Tally]]()
     receipt = Receipt(session.rig, size, None)
     measured, kind, next_number = 0, "", 0
     focal_baseline = float(camera.K[0, 0]) * pipeline.rectifier.baseline
@@ -241,11 +227,14 @@ def measure_recording(
             reference = frame.reference
             if number < next_number or reference is None or reference.depth is None:
                 continue
-            next_number = number + every
+            next_number = number + EVERY
             truth, kind = metrics.resample_nearest(reference.depth, *size), reference.depth_kind
             drawn, tissue = result.views["left"].depth, result.observation.tissue
             stage = comparison.add(result.pair, tissue, truth, {MODEL: drawn})
-            regions.add(stage, drawn, truth, regions_of(truth, tissue, focal_baseline))
+            for name, mask in regions_of(truth, tissue, focal_baseline).items():
+                tallies = regions.setdefault(name, {"stage": Tally(), "drawn": Tally()})
+                for tally, depth in zip(tallies.values(), (stage, drawn), strict=True):
+                    tally.add(depth, np.ones_like(depth), truth, mask, stage > 0)
             receipt.add(frame, tissue)
             measured += 1
     if measured == 0:
@@ -258,25 +247,28 @@ def measure_recording(
         "machine": machine_name(),
         "settings": comparison.rows(),
         "confidence": comparison.tallies["as configured"].by_confidence(),
-        "regions": regions.rows(),
+        "regions": [
+            {"region": name, **{which: tally.errors() for which, tally in tallies.items()}}
+            for name, tallies in regions.items()
+        ],
         "receipt": receipt.as_json(),
     }
 
 
 def measure_faults(
-    size: tuple[int, int],
-    frames: int,
-    faults: Mapping[str, Sequence[float]],
     advance: Advance,
     network: Path | None = None,
+    size: tuple[int, int] = (640, 512),
+    frames: int = 4,
+    faults: Mapping[str, Sequence[float]] = FAULTS,
 ) -> dict[str, Any]:
     """Measure the phantom, whose depth is known exactly, with one fault of its images rising at a time.
 
     Args:
+        network: an ONNX file to compare as well.
         size: width and height of the images, px.
         frames: of each level, evenly over the whole motion.
         faults: levels by the name of the fault in `PhantomScene`.
-        network: an ONNX file to compare as well.
     """
     levels = [(fault, level) for fault, values in faults.items() for level in values]
     rows = []
@@ -287,7 +279,9 @@ def measure_faults(
         matchers = make_matchers(StereoConfig(), rectifier.camera, rectifier.baseline, network)
         comparison = Comparison(matchers)
         receipt, white = Receipt(phantom.rig, size, None), []
-        for frame, truth in _phantom_frames(phantom, frames):
+        for index in range(frames):
+            truth = phantom.frame(index, frames)
+            frame = StereoFrame(index, 0, 0, truth.left, truth.right)
             pair, tissue = rectifier(frame), rectifier.mask(~truth.tool)
             comparison.add(pair, tissue, truth.depth, {})
             receipt.add(frame, tissue)
@@ -316,12 +310,6 @@ def frame_of(number: int, rate: float, truth: PhantomFrame) -> StereoFrame:
     """Return a phantom's frame as a camera of `rate` frames per second gives it, with its true mask."""
     stamp = round((1 + number / rate) * 1e9)
     return StereoFrame(number, stamp, stamp, truth.left, truth.right, tissue=~truth.tool)
-
-
-def _phantom_frames(phantom: Phantom, count: int) -> Iterable[tuple[StereoFrame, PhantomFrame]]:
-    for index in range(count):
-        truth = phantom.frame(index, count)
-        yield StereoFrame(index, 0, 0, truth.left, truth.right), truth
 
 
 def regions_of(truth: F32, tissue: Bool, focal_baseline: float) -> dict[str, Bool]:

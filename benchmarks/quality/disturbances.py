@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import cv2
 import numpy as np
 
 from benchmarks import Advance
@@ -21,6 +22,7 @@ from sags_node.messaging import published
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.pipeline.session import Session
 from sags_node.quality import metrics
+from sags_node.quality.gallery import Picture, depth_range, depth_tile, shrunk
 from sags_node.sources.source import open_source
 from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import F32, F64, I64, U8, AnchorStates, Bool, FrameResult, RenderedView, StereoFrame
@@ -53,14 +55,6 @@ class Shot:
 
 
 @dataclass(frozen=True, slots=True)
-class _Depth:
-    """Published depth of one frame against its reference, over the true tissue."""
-
-    all: metrics.DepthErrors
-    confident: metrics.DepthErrors
-
-
-@dataclass(frozen=True, slots=True)
 class _Shown:
     """What one frame of a run showed."""
 
@@ -68,9 +62,17 @@ class _Shown:
     model_psnr: float  # dB, the same of the model alone
     borrowed: float  # share of the published depth, see `_Run._borrowed`
     confident_borrowed: float  # share of the depth that is published as confident
-    depth: _Depth | None  # None: there is no reference
+    depth: dict[str, metrics.DepthErrors]  # `all` that is published, and `confident`; empty: no reference
     warnings: frozenset[str]
     restarts: int  # of the model, since the first frame
+
+
+TABLES = (
+    "name psnr_before psnr_during psnr_after frames_to_recover model_psnr_during model_psnr_after"
+    " model_frames_to_recover restarts",
+    "name confident_depth_p90_mm depth_median_mm coverage borrowed_share warned_after_s cleared_after_s"
+    " warned_of anchors_back anchors_wrong",
+)
 
 
 def measure_disturbances(
@@ -79,12 +81,9 @@ def measure_disturbances(
     start: int | None,
     seconds: float,
     advance: Advance,
-    look: Callable[[str, list[Shot]], None] = lambda name, shots: None,
+    look: Callable[[str, list[Shot]], None],
 ) -> dict[str, Any]:
-    """Play a recording once for each disturbance, frame by frame, one step of the mapper a frame.
-
-    Images are compared with the undisturbed image of their time, over the tissue that the recording's own
-    masks say, where it has them. The undisturbed run is always played first: the others are judged by it.
+    """Play a recording once for each disturbance, the undisturbed run first: the others are judged by it.
 
     Args:
         names: of `DISTURBANCES`.
@@ -94,10 +93,6 @@ def measure_disturbances(
 
     Returns:
         `rows`, one for each name; the keys are explained in benchmarks/disturbances.md.
-
-    Raises:
-        UsageError: one camera alone, or the recording is too short.
-        SagsError: the recording cannot be read, or nothing can be pinned.
     """
     configure_threads(session.config.engine.threads)
     rate, during = _stretch(session, start, seconds)
@@ -209,13 +204,14 @@ class _Run:
         shown, true = published.colours(view, size), metrics.as_float(published.picture(truth, "left"))
         borrowed = self._borrowed(frame.frame_id, result)
         drawn = view.depth > 0
-        confident = drawn & _is_confident(view)
+        sure = np.float32(1) if view.confidence is None else view.confidence
+        confident = drawn & (sure >= CONFIDENT)
         self._shown[frame.frame_id] = _Shown(
             psnr=metrics.psnr(metrics.as_float(shown), true, where),
             model_psnr=metrics.psnr(metrics.as_float(view.colours.at(*size)), true, where),
             borrowed=_share(borrowed, drawn),
             confident_borrowed=_share(borrowed, confident),
-            depth=_depth_errors(frame, view, confident, tissue),
+            depth=_depth_errors(frame, view.depth, confident, tissue),
             warnings=frozenset(by_code(self._pipeline.warnings)),
             restarts=self._pipeline.map.restarts,
         )
@@ -242,11 +238,8 @@ class _Run:
         before = [shown for frame, shown in self._shown.items() if first - self._rate <= frame < first]
         within = [shown for frame, shown in self._shown.items() if frame in self.during]
         after = [shown for frame, shown in self._shown.items() if frame >= stop + RECOVERY]
-        depths = [
-            shown.depth
-            for frame, shown in self._shown.items()
-            if first <= frame < stop + RECOVERY and shown.depth is not None
-        ]
+        amid = (shown.depth for frame, shown in self._shown.items() if first <= frame < stop + RECOVERY)
+        depths = [each for each in amid if each]
         psnrs = {
             f"{key}_{when}": _over(getattr(shown, key) for shown in frames)
             for key in ("psnr", "model_psnr")
@@ -261,10 +254,10 @@ class _Run:
             "name": self._name,
             "frames": len(self.during),
             **psnrs,
-            "confident_depth_p90_mm": _over((depth.confident.p90_mm for depth in depths), max),
-            "depth_median_mm": _over((depth.all.median_mm for depth in depths), max),
-            "coverage": _over((depth.all.coverage for depth in depths), min),
-            "confident_coverage": _over((depth.confident.coverage for depth in depths), min),
+            "confident_depth_p90_mm": _over((depth["confident"].p90_mm for depth in depths), max),
+            "depth_median_mm": _over((depth["all"].median_mm for depth in depths), max),
+            "coverage": _over((depth["all"].coverage for depth in depths), min),
+            "confident_coverage": _over((depth["confident"].coverage for depth in depths), min),
             "borrowed_share": _over(shown.borrowed for shown in within),
             "confident_borrowed_share": _over(shown.confident_borrowed for shown in within),
             "warned_after_s": _round(warned),
@@ -287,15 +280,9 @@ class _Run:
 def frames_to_recover(
     psnr: Mapping[int, float], clean: Mapping[int, float], stop: int, before: float | None
 ) -> int | None:
-    """Count the frames from the end of a disturbance until `STEADY` frames in a row are within `WITHIN_DB` of
-    the PSNR before it, or of the undisturbed run's same frames, where those are worse; None: never.
-
-    Args:
-        psnr: frame_id -> dB, of the run; lost frames are not in it.
-        clean: the same of the undisturbed run.
-        stop: the first frame after the disturbance.
-        before: dB.
-    """
+    """Count the frames from the end of a disturbance, `stop`, until `STEADY` frames in a row are within
+    `WITHIN_DB` of the PSNR before it, or of the undisturbed run's same frames, where those are worse; None:
+    never. PSNR is by frame_id, dB; lost frames are not in it."""
     if before is None:
         return None
     frames = sorted(frame for frame in psnr if frame >= stop)
@@ -308,13 +295,7 @@ def warning_times(
     warnings: Mapping[int, frozenset[str]], during: range, rate: float
 ) -> tuple[float | None, float | None]:
     """Return the seconds from the beginning of a disturbance to the first warning, and from its end until
-    there is none; None: never.
-
-    Args:
-        warnings: frame_id -> the codes of the warnings, without those that warned before.
-        during: frames of the disturbance.
-        rate: frames per second.
-    """
+    there is none; None: never. `warnings`: their codes by frame_id, without those that warned before."""
     warned = [frame for frame, codes in warnings.items() if codes and frame >= during.start]
     if not warned:
         return None, None
@@ -335,11 +316,7 @@ class _PinnedAnchors:
         self._truth: dict[int, F64] = {}  # frame_id -> points [A, 3] (m, world), where the recording has any
 
     def pin(self, frame: StereoFrame, result: FrameResult) -> None:
-        """Pin anchors on visible true surface points, where the recording has them, else on a grid.
-
-        Raises:
-            SagsError: nothing can be pinned.
-        """
+        """Pin anchors on visible true surface points, where the recording has them, else on a grid."""
         self.pinned = True
         shown = result.observation, result.snapshot, result.views["left"]
         points = true_points(frame, result)
@@ -392,20 +369,15 @@ class _PinnedAnchors:
         }
 
 
-def _is_confident(view: RenderedView) -> Bool:
-    """Where [H, W] a view is confident; everywhere, if it has no confidence."""
-    if view.confidence is None:
-        return np.ones(view.depth.shape, np.bool_)
-    return np.asarray(view.confidence >= CONFIDENT)
-
-
-def _depth_errors(frame: StereoFrame, view: RenderedView, confident: Bool, tissue: Bool) -> _Depth | None:
+def _depth_errors(
+    frame: StereoFrame, depth: F32, confident: Bool, tissue: Bool
+) -> dict[str, metrics.DepthErrors]:
     if frame.reference is None or frame.reference.depth is None:
-        return None
-    height, width = view.depth.shape
-    truth = metrics.resample_nearest(frame.reference.depth, width, height)
-    sure = np.where(confident, view.depth, np.float32(0))
-    return _Depth(metrics.depth_errors(view.depth, truth, tissue), metrics.depth_errors(sure, truth, tissue))
+        return {}
+    truth = metrics.resample_nearest(frame.reference.depth, *depth.shape[::-1])
+    sure = np.where(confident, depth, np.float32(0))
+    parts = {"all": depth, "confident": sure}
+    return {name: metrics.depth_errors(part, truth, tissue) for name, part in parts.items()}
 
 
 def _share(part: Bool, whole: Bool) -> float:
@@ -421,3 +393,18 @@ def _over(values: Iterable[float], figure: Callable[..., Any] = np.mean) -> floa
 
 def _round(value: float | None) -> float | None:
     return None if value is None else round(value, 3)
+
+
+def strip(shots: Sequence[Shot]) -> bytes:
+    """Draw a PNG with a row each for before, middle and after: the left and right images as they came, what
+    is shown, and the depth, which is grey on tissue where none is published."""
+    shown = [
+        Picture(shot.view.frame_id, 0.0, shot.left, shot.shown, shot.view.depth, shot.tissue)
+        for shot in shots
+    ]
+    near, far = depth_range(shown[::2])  # those that nothing is wrong with
+    lines = [
+        np.hstack([shrunk(shot.left), shrunk(shot.right), shrunk(each.render), depth_tile(each, near, far)])
+        for shot, each in zip(shots, shown, strict=True)
+    ]
+    return cv2.imencode(".png", np.vstack(lines)[..., ::-1])[1].tobytes()

@@ -1,16 +1,13 @@
 """How accurately instruments are placed: in front of the phantom, where their tips are known."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
-from rich.table import Table
 
 from benchmarks import Advance
 from benchmarks.quality.depth import frame_of, rounded, spread
-from benchmarks.tables import filled
 from sags_node.confidence import SURE, error_of
 from sags_node.config.schema import LaunchConfig
 from sags_node.geometry import project, unproject
@@ -124,6 +121,13 @@ def off(tool: Tool, place: F64) -> float:
     way = tool.ends[1] - tool.ends[0]
     share = np.clip((place - tool.ends[0]) @ way / max(way @ way, 1e-12), 0, 1)
     return 1e3 * float(np.linalg.norm(tool.ends[0] + share * way - place))
+
+
+TABLES = (
+    "tip_mm.median tip_mm.p90 axis_deg.median axis_deg.p90 within_told sure placed",
+    "sure_tip_mm.median sure_tip_mm.p90 distance_mm.median distance_mm.p90 clearance_mm.median"
+    " far_end_on_tissue_mm.median far_end_by_stereo_mm.median instruments",
+)
 
 
 def measure_instruments(seeds: int, advance: Advance) -> dict[str, Any]:
@@ -255,20 +259,3 @@ def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
             if values:
                 said[f"{prefix}{name}"] = {"count": len(values), **spread(values)}
     return said
-
-
-def tables(measured: dict[str, Any]) -> list[Table]:
-    """Make the tables for people."""
-    names = ("sure_tip_mm", *SAID, *BESIDE)
-    table = Table("", "placed", "sure", "within told", *names, title="errors: median, nine of ten")
-    for part in ("settings", "distances_mm", "kinds"):
-        for name, row in measured[part].items():
-            add(table, row, "instruments", names, name)
-    return [table]
-
-
-def add(table: Table, row: dict[str, Any], what: str, names: Sequence[str], *head: str) -> None:
-    """Add a row to a table: the counts of `tally`, and each figure's median and 90th percentile."""
-    figures = [f"{row[n]['median']}, {row[n]['p90']}" if n in row else "" for n in names]
-    cells = f"{{placed}} of {{{what}}}", "{sure}", "{within_told}"
-    filled(table, [row], *head, *cells, *figures, unknown="")

@@ -5,11 +5,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from rich.table import Table
 
 from benchmarks import Advance
 from benchmarks.quality.depth import frame_of, spread
-from benchmarks.quality.instruments import FIRST, KINDS, SIZE, STEPS, TROCARS, Scene, Tool, add, placed, tally
+from benchmarks.quality.instruments import FIRST, KINDS, SIZE, STEPS, TROCARS, Scene, Tool, placed, tally
 from sags_node.config.schema import LaunchConfig
 from sags_node.geometry import rigid
 from sags_node.instruments.instruments import Instruments
@@ -130,12 +129,3 @@ def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         if values := [row[name] for row in there if name in row]:
             said[name] = spread(values)
     return said
-
-
-def table(measured: dict[str, Any]) -> Table:
-    """Make the table for people."""
-    shown = Table("", "", "placed", "sure", "within told", *FIGURES, title="kinematics: median, nine of ten")
-    for case in CASES:
-        for part, row in measured[case].items():
-            add(shown, row, "frames", FIGURES, case, part)
-    return shown

@@ -4,11 +4,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from benchmarks import Advance
-from benchmarks.tables import filled
-from sags_node.config.schema import TissueConfig
 from sags_node.errors import SagsError
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
@@ -23,15 +20,17 @@ from sags_node.vision.tissue import TissueMask
 Row = dict[str, Any]
 
 
+TABLES = (
+    "session frames masks iou missed tissue_lost flicker mask_ms online_psnr depth_median_mm depth_p90_mm"
+    " depth_coverage",
+)
+
+
 def measure_masks(session: Session, advance: Advance) -> Row:
-    """Play a recording that has masks of its own, with those that its launch file asks for, one step of the
-    mapper a frame.
+    """Play a recording that has masks of its own, with those that its launch file asks for.
 
     Masks are compared with the recording's own without dilation. Images and depth are measured under the
     recording's own mask, whatever the mapper was given, so figures of different sources are comparable.
-
-    Raises:
-        SagsError: the recording has no masks.
     """
     configure_threads(session.config.engine.threads)
     run, method = _Run(session), session.config.vision.tissue.method
@@ -49,10 +48,13 @@ class _Run:
         config = session.config.vision.tissue
         self._pipeline = Pipeline(session.config, session.rig)
         self._budget = StepBudget(1)
-        self._given = self._mask(config.model_copy(update={"method": "session"}))
-        self._given_bare = self._mask(config.model_copy(update={"method": "session", "dilate": 0}))
-        self._found_bare = self._mask(config.model_copy(update={"dilate": 0}))
-        self._everything = self._mask(config.model_copy(update={"method": "none"}))
+        self._given, self._given_bare, self._found_bare, self._everything = (
+            TissueMask(config.model_copy(update=changed), self._pipeline.rectifier)
+            for changed in (
+                *({"method": "session"}, {"method": "session", "dilate": 0}),
+                *({"dilate": 0}, {"method": "none"}),
+            )
+        )
         self._before: tuple[Bool, Bool] | None = None  # instruments given and found
         self._pixels = np.zeros(5)  # usable, given, found, both, flickering
         self._mask_ms: list[float] = []
@@ -61,15 +63,8 @@ class _Run:
         self._receipt = Receipt(session.rig, session.working_size, None)
         self.frames = 0
 
-    def _mask(self, config: TissueConfig) -> TissueMask:
-        return TissueMask(config, self._pipeline.rectifier)
-
     def take(self, frame: StereoFrame) -> None:
-        """Map one frame and measure it.
-
-        Raises:
-            SagsError: it has no mask.
-        """
+        """Map one frame and measure it."""
         if frame.tissue is None:
             raise SagsError(f"frame {frame.frame_id} has no mask to compare with; choose another recording")
         before = self._pipeline.newest
@@ -124,9 +119,3 @@ def _ratio(part: float, whole: float) -> float:
 
 def _mean(values: Sequence[float]) -> float | None:
     return round(float(np.nanmean(values)), 3) if values else None
-
-
-def table(rows: Sequence[Row]) -> Table:
-    """Make the table; each row as `measure_masks` returns it."""
-    columns = [key for key in rows[0] if key != "receipt"]
-    return filled(Table(*columns), rows, *(f"{{{key}}}" for key in columns))

@@ -8,12 +8,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from benchmarks import Advance
 from benchmarks.quality.depth import rounded
 from benchmarks.quality.tracking import middle, pin, true_points
-from benchmarks.tables import filled
 from sags_node.errors import SagsError
 from sags_node.geometry import project
 from sags_node.mapping.budget import StepBudget
@@ -47,12 +45,14 @@ class _Tally:
     unsure: list[float] = field(default_factory=list)  # errors of values that were not sure
 
 
-def measure_lengths(session: Session, advance: Advance, seed: int = 0) -> dict[str, Any]:
-    """Measure between anchors of a recording that has true points.
+TABLES = (
+    "anchors values told.p50 told.p90 within_told kept.p50 kept.p90 stretch_error.p50 stretch_within_told"
+    " error.p50 error.p90",
+)
 
-    Raises:
-        SagsError: it has none, or nothing can be pinned.
-    """
+
+def measure_lengths(session: Session, advance: Advance, seed: int = 0) -> dict[str, Any]:
+    """Measure between anchors of a recording that has true points."""
     prepare(session.config)
     pipeline, budget = Pipeline(session.config, session.rig), StepBudget(STEPS)
     receipt = Receipt(session.rig, session.working_size, None)
@@ -73,7 +73,10 @@ def measure_lengths(session: Session, advance: Advance, seed: int = 0) -> dict[s
             elif number % EVERY == 0:
                 receipt.add(frame, result.observation.tissue)
                 found = _values(result, shapes)
-                exact = [_exact(kind, truth[rows], corners) for kind, corners in shapes]
+                exact = [
+                    (area_of if kind == "area" else length_of)(truth[rows][np.array(corners) - 1])
+                    for kind, corners in shapes
+                ]
                 first, firsts = first or exact, firsts or found
                 rest = zip(shapes, found, exact, firsts, first, strict=True)
                 for (kind, _), now, true, before, truly in rest:
@@ -103,10 +106,6 @@ def _values(result: FrameResult, shapes: list[tuple[str, list[int]]]) -> list[Me
         )  # fmt: skip
         frame[name] = interpret(Message(name, meta, body.parts), 0)
     return [measure(frame, corners, kind == "area") for kind, corners in shapes]
-
-
-def _exact(kind: str, points: F64, corners: list[int]) -> float:
-    return (area_of if kind == "area" else length_of)(points[np.array(corners) - 1])
 
 
 def _add(tally: _Tally, unit: float, found: Measured, exact: float, first: Measured, before: float) -> None:
@@ -155,25 +154,3 @@ def _spread(values: F64) -> dict[str, float] | None:
     if not len(values):
         return None
     return {"p50": rounded(np.median(values)), "p90": rounded(np.percentile(values, 90))}
-
-
-def tables(measured: dict[str, Any]) -> list[Table]:
-    """Make the tables for people."""
-    made = Table(
-        "mm, mm2", "", "values", "off by p50, p90", "told", "within told", "the first kept", "stretch off by",
-        "within told",
-        title=f"{measured['session']}, {measured['anchors']} anchors",
-    )  # fmt: skip
-    for kind in CORNERS:
-        for which in ("all", "changed"):
-            row = measured[kind][which]
-            error, told, kept, stretch = (_two(row[k]) for k in ("error", "told", "kept", "stretch_error"))
-            cells = error, told, "{within_told:.0%}", kept, stretch, "{stretch_within_told:.0%}"
-            filled(made, [row], kind, which, "{values}", *cells)
-        unsure = measured[kind]["unsure"]
-        made.add_row(kind, "unsure", str(unsure["values"]), _two(unsure["error"]))
-    return [made]
-
-
-def _two(spread: dict[str, float] | None) -> str:
-    return "-" if spread is None else f"{spread['p50']:.3g}, {spread['p90']:.3g}"

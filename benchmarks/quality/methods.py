@@ -10,10 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from benchmarks import Advance
-from benchmarks.tables import filled
 from sags_node.config.schema import MappingMethod
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
@@ -34,18 +32,17 @@ WINDOW_NS = 2_000_000_000  # as long as the field remembers
 SHOWN = {"online": "psnr", "predict": "psnr", "heldout": "psnr", "depth": "median_mm", "track": "median_px"}
 
 
+STEPS = ("mapping.iterations:=3", "mapping.rung:=7")  # of the run frame by frame
+TABLES = (
+    "width height method live.rate_hz live.latency_ms.p50 live.latency_ms.p99 live.psnr step.online"
+    " step.predict step.heldout step.window step.depth step.track step.frame_ms.p50",
+)
+
+
 def measure_methods(
-    launch: Path | str | None, overrides: Sequence[str], iterations: int, rung: int, advance: Advance
+    launch: Path | str | None, overrides: Sequence[str], advance: Advance
 ) -> list[dict[str, Any]]:
-    """Measure a row for each size and method.
-
-    Args:
-        iterations, rung: of the run frame by frame.
-        advance: called with what is going on.
-
-    Raises:
-        UsageError, SagsError: see `evaluate`.
-    """
+    """Measure a row for each size and method."""
     rows: list[dict[str, Any]] = []
     for width, height in SIZES:
         for method in METHODS:
@@ -56,7 +53,6 @@ def measure_methods(
             alone = [*chosen, "publish.detail:=false"]  # the model is compared, not the camera's images
             seen = evaluate(launch, alone, MeasureOptions(hold_out=0), pace="realtime")
             live = seen.summary
-            fixed = [*alone, f"mapping.iterations:={iterations}", f"mapping.rung:={rung}"]
             row: dict[str, Any] = {"method": method, "width": width, "height": height}
             row["live"] = {
                 "rate_hz": live["rate_hz"],
@@ -65,7 +61,7 @@ def measure_methods(
                 "psnr": live["online"]["psnr"],
                 "receipt": seen.receipt,
             }
-            rows.append(row | _step_by_step(launch, fixed))
+            rows.append(row | _step_by_step(launch, [*alone, *STEPS]))
     return rows
 
 
@@ -100,20 +96,3 @@ def _window_psnr(pipeline: Pipeline, run: Run, pictures: dict[int, U8]) -> float
         drawn = colours_of(rasterizer.forward(now, seen_by))
         found.append(psnr(drawn, as_float(pictures[frame_id]), shown.tissue))
     return float(np.mean(found))
-
-
-def table(rows: Sequence[dict[str, Any]]) -> Table:
-    """Make the table for people."""
-    columns = (
-        "size", "method", "rate Hz", "p50 / p99 ms", "live dB", "step: online", "next frame", "held out",
-        "window", "depth mm", "track px", "ms",
-    )  # fmt: skip
-    shown = Table(*columns, title="Control nodes, and the paper's field")
-    live = (
-        "{live[rate_hz]:.1f}",
-        "{live[latency_ms][p50]:.0f} / {live[latency_ms][p99]:.0f}",
-        "{live[psnr]:.1f}",
-    )
-    steps = (f"{{step[{key}]:.2f}}" for key in ("online", "predict", "heldout", "window", "depth", "track"))
-    cells = "{width} x {height}", "{method}", *live, *steps, "{step[frame_ms][p50]:.0f}"
-    return filled(shown, rows, *cells)

@@ -12,12 +12,9 @@ from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
-from rich.table import Table
 
 from benchmarks import Advance
-from benchmarks.quality.tracking import RIGHT, RIGHT_MM, pin, reliability_rows
-from benchmarks.quality.tracking_report import reliability_tables
-from benchmarks.tables import filled
+from benchmarks.quality.tracking import RELIABILITY, RIGHT, RIGHT_MM, pin, reliability_rows
 from sags_lab.protocols.point_tracks import SURE
 from sags_node.config.schema import PhantomSource
 from sags_node.errors import UsageError
@@ -58,22 +55,17 @@ class _Moment:
     hidden: Bool | None  # [H, W] raw left image, True = cloth
 
 
-def measure_recall(session: Session, away: float, advance: Advance) -> dict[str, Any]:
-    """Play each scenario once. An anchor is found if it is within `RIGHT` of its point.
+TABLES = ("scenario anchors before.found before.wrong found wrong unmoved", RELIABILITY)
 
-    Args:
-        session: of the phantom; its size and seed are used.
-        away: s out of sight.
+
+def measure_recall(session: Session, away: float, advance: Advance) -> dict[str, Any]:
+    """Play each scenario once, `away` s out of sight, on the phantom of the session's size and seed.
 
     Returns:
         `rows`, by scenario: anchors, and shares of those whose points are in sight. `found`: sure and right,
         `wrong`: sure and farther off than `WRONG`, 2.4 s after they are back, and `before` they went;
         `unmoved`: right if they had not moved. `reliability_mm`, `reliability_px`: of all anchors in all
         frames that were not held; in px only of those whose points are in the image or hidden there.
-
-    Raises:
-        UsageError: the session is not the phantom's.
-        SagsError: nothing can be pinned.
     """
     source = session.config.source
     if not isinstance(source, PhantomSource):
@@ -135,9 +127,7 @@ def _played(
         if number == before // 3:
             last = result.pair.camera.width - BORDER, result.pair.camera.height - BORDER
             middle = (truth > BORDER).all(1) & (truth < last).all(1)
-            wanted = np.flatnonzero(visible & middle)[:MOST]
-            otherwise = "nothing could be pinned; choose another source.seed"
-            pinned = pin(pipeline, result, truth, wanted, otherwise)
+            pinned = pin(pipeline, result, truth, np.flatnonzero(visible & middle)[:MOST])
         if number == before - 1:
             at_last = _scored(result.anchors, pinned, truth, visible, width)
             standing = result.anchors
@@ -216,9 +206,7 @@ def _place(scenario: Scenario, since: int, away: int) -> F64:
 
 def _dark(frame: PhantomFrame, seed: int) -> PhantomFrame:
     noise = np.random.default_rng(seed).integers(0, 4, frame.left.shape).astype(np.uint8)
-    return PhantomFrame(
-        noise, noise, frame.tool, frame.depth, frame.points, np.zeros_like(frame.visible), frame.T_world_cam
-    )
+    return replace(frame, left=noise, right=noise, visible=np.zeros_like(frame.visible))
 
 
 def _stereo(number: int, moment: _Moment) -> StereoFrame:
@@ -243,14 +231,3 @@ def _truth(result: FrameResult, moment: _Moment) -> tuple[F64, Bool]:
 def _inside(pixels: F64, camera: Camera) -> Bool:
     inside = (pixels > 0) & (pixels < [camera.width - 1, camera.height - 1])
     return np.asarray(inside.all(1))
-
-
-def tables(measured: dict[str, Any]) -> list[Table]:
-    """Make the tables; `measured` as `measure_recall` returns it."""
-    made = Table(
-        "out of sight", "anchors", "right before", "wrong", "found again", "wrong", "had they not moved",
-        title=f"{measured['away_s']:g} s out of sight",
-    )  # fmt: skip
-    shares = "{before[found]:.0%}", "{before[wrong]:.0%}", "{found:.0%}", "{wrong:.0%}", "{unmoved:.0%}"
-    filled(made, measured["rows"], "{scenario}", "{anchors}", *shares)
-    return [made, *reliability_tables(measured)]

@@ -10,12 +10,10 @@ from typing import Any, get_args
 
 import cv2
 import numpy as np
-from rich.table import Table
 
 from benchmarks import Advance
 from benchmarks.quality.depth import frame_of, rounded, spread
 from benchmarks.quality.depth_ct import CTPair, configured_depth, read_ct_pair
-from benchmarks.tables import filled
 from sags_node.clients.registration.register import Registration, Verdict, register
 from sags_node.clients.registration.rigid import kabsch
 from sags_node.clients.registration.surfaces import MIRROR, Shape, Surface
@@ -70,24 +68,24 @@ class Case:
 class Placing:
     """The result of one case. Errors are by pose: by_pairs, open3d, and fitted unless it was refused."""
 
-    verdict: Verdict
-    reason: str
-    share: float  # as `Registration.share`
+    found: Registration
     errors_mm: dict[str, list[float]]  # of each target
     told_mm: dict[str, list[float]]  # stated errors of each target; Open3D states none
 
     def as_json(self, seed: int) -> dict[str, Any]:
         """Return what is kept of the result."""
-        said = {"seed": seed, "verdict": self.verdict, "reason": self.reason, "share": self.share}
-        return {**said, "fitted_mm": self.errors_mm.get("fitted", [])}
+        said = {"seed": seed, "verdict": self.found.verdict, "reason": self.found.reason}
+        return {**said, "share": rounded(self.found.share), "fitted_mm": self.errors_mm.get("fitted", [])}
+
+
+TABLES = (
+    "told_mm within_told p90_mm median_mm",
+    "what refused of with_its_remedy said",
+)
 
 
 def measure_registration(ct: Path | None, seeds: int, advance: Advance) -> dict[str, Any]:
-    """Register on each seed's phantom and, with `ct`, on the CT surface, and count the refusals.
-
-    Args:
-        ct: folder of the pair with a CT surface; None: the phantom only.
-    """
+    """Register on each seed's phantom and, with the folder `ct`, on the CT surface; count the refusals."""
     config = LaunchConfig(source=PhantomScene(width=SIZE[0], height=SIZE[1]))
     prepare(config)
     placings: list[Placing] = []
@@ -173,7 +171,7 @@ def _registered(case: Case, surface: Surface) -> Placing:
         errors["fitted"] = found.T_world_model
         told = {"by_pairs": _mm(found.expected_by_pairs), "fitted": _mm(found.expected)}
     errors_mm = {name: _mm(case.errors(T)) for name, T in errors.items()}
-    return Placing(found.verdict, found.reason, rounded(found.share), errors_mm, told)
+    return Placing(found, errors_mm, told)
 
 
 def _open3d(model: Shape, surface: Surface, T: F64) -> F64:
@@ -258,7 +256,7 @@ def _mm(lengths: F64) -> list[float]:
 def _summary(placings: list[Placing]) -> dict[str, Any]:
     """Figures of all targets of all seeds."""
     said: dict[str, Any] = {"seeds": len(placings)}
-    verdicts = [each.verdict for each in placings]
+    verdicts = [each.found.verdict for each in placings]
     said["verdicts"] = {verdict: verdicts.count(verdict) for verdict in get_args(Verdict)}
     for name in ("by_pairs", "fitted", "open3d"):
         errors = np.array([error for each in placings for error in each.errors_mm.get(name, ())])
@@ -278,25 +276,9 @@ def _summary(placings: list[Placing]) -> dict[str, Any]:
 def _counted(refusals: list[tuple[str, Registration, str]]) -> list[dict[str, Any]]:
     counted: dict[str, dict[str, Any]] = {}
     for name, found, word in refusals:
-        row = counted.setdefault(
-            name, {"what": name, "of": 0, "refused": 0, "with_its_remedy": 0, "said": ""}
-        )
+        row = counted.setdefault(name, {"what": name, "of": 0, "refused": 0, "with_its_remedy": 0})
         row["of"] += 1
         row["refused"] += found.verdict == "refused"
         row["with_its_remedy"] += found.verdict == "refused" and word in found.reason
         row["said"] = found.reason
     return list(counted.values())
-
-
-def tables(measured: dict[str, Any]) -> list[Table]:
-    """Make the tables for people."""
-    errors = Table(
-        "", "pose by", "median, mm", "nine of ten, mm", "told, mm", "within told", title="targets' error"
-    )
-    for scene in ("phantom", "ct"):
-        for name in ("by_pairs", "fitted", "open3d") if scene in measured else ():
-            cells = scene, name, "{median_mm}", "{p90_mm}", "{told_mm}", "{within_told:.0%}"
-            filled(errors, [measured[scene][name]], *cells, unknown="")
-    refused = Table("what", "refused", "with its remedy", "said", title="to be refused")
-    filled(refused, measured["refused"], "{what}", "{refused} of {of}", "{with_its_remedy}", "{said}")
-    return [errors, refused]

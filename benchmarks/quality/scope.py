@@ -11,11 +11,9 @@ from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
-from rich.table import Table
 
 from benchmarks import Advance
 from benchmarks.quality.depth import frame_of
-from benchmarks.tables import filled
 from sags_node.config.schema import LaunchConfig, PhantomSource, PoseWay
 from sags_node.errors import UsageError
 from sags_node.geometry import project, rigid
@@ -91,22 +89,22 @@ class _Played:
         }
 
 
+TABLES = (
+    "motion way max_mm rpe_mm rpe_deg end_mm end_deg drift_mm drift_deg worst_drift_mm worst_drift_deg"
+    " ate_mm",
+    "motion way depth_median_mm depth_p90_mm held psnr",
+)
+
+
 def measure_scope(
     config: LaunchConfig, motions: Sequence[Motion], seconds: float, advance: Advance
 ) -> dict[str, Any]:
-    """Measure each motion of the scope once.
-
-    Args:
-        config: of the phantom; `source.rate` and the settings of its tissue are used.
-        seconds: of each.
+    """Measure each motion of the scope once, so many seconds.
 
     Returns:
         `rows`, by `motion` and `way`. `session`: the true poses are given; `estimate`: none; `robot`: those
         of a `Robot`; `refine`: the same, corrected; `rigid` and `points`: see the module. Errors are those of
         `trajectory_errors` and `drift`, images and depth over frames that were not `held`.
-
-    Raises:
-        UsageError: the source is not the phantom, or the time is too short.
     """
     source = config.source
     if not isinstance(source, PhantomSource):
@@ -139,7 +137,10 @@ def _measured(
     """The rows of one motion, and the receipt of what was shown to the ways to know the pose."""
     count, robot = round(seconds * rate), Robot()
     ways: dict[str, PoseWay] = {way: way for way in ("session", "estimate", "refine")} | {"robot": "session"}
-    played = {name: _Played(Pipeline(_with_pose(config, way), phantom.rig)) for name, way in ways.items()}
+    played = {}
+    for name, way in ways.items():
+        posed = config.vision.model_copy(update={"pose": way})
+        played[name] = _Played(Pipeline(config.model_copy(update={"vision": posed}), phantom.rig))
     rigid, rigid_poses, points = RigidOdometry(), list[F64](), _Points(phantom)
     raw = phantom.rig.left
     receipt = Receipt(phantom.rig, config.vision.working_size(raw.width, raw.height), None)
@@ -168,11 +169,6 @@ def _measured(
     return rows, receipt.as_json()
 
 
-def _with_pose(config: LaunchConfig, way: PoseWay) -> LaunchConfig:
-    vision = config.vision.model_copy(update={"pose": way})
-    return config.model_copy(update={"vision": vision})
-
-
 class _Points:
     """The phantom's true surface points over time."""
 
@@ -199,23 +195,6 @@ class _Points:
             fit = fit_pose(rest[visible], pixels.astype(np.float32), disparities, there, self._baseline)
             fitted.append(fit.T_world_cam)
         return fitted
-
-
-def table(measured: dict[str, Any]) -> Table:
-    """Make the table; `measured` as `measure_scope` returns it."""
-    made = Table(
-        "motion", "pose", "ATE / max, mm", "RPE, mm / deg", "at the end, mm / deg", "drift, mm / deg",
-        "worst drift", "PSNR, dB", "depth, median / p90, mm", "held",
-        title=f"{measured['seconds']:g} s at {measured['rate']:g} Hz",
-    )  # fmt: skip
-    for row in measured["rows"]:
-        shown = ("{psnr:.2f}", "{depth_median_mm:.2f} / {depth_p90_mm:.2f}", "{held}")
-        filled(
-            made, [row], "{motion}", "{way}", "{ate_mm:.2f} / {max_mm:.2f}", "{rpe_mm:.3f} / {rpe_deg:.3f}",
-            *(f"{{{each}_mm:.2f}} / {{{each}_deg:.2f}}" for each in ("end", "drift", "worst_drift")),
-            *(shown if "psnr" in row else ()),
-        )  # fmt: skip
-    return made
 
 
 def drift(estimated: F64, known: F64, period: int) -> dict[str, float]:

@@ -3,11 +3,9 @@
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from benchmarks import Advance
 from benchmarks.quality.depth import frame_of, rounded, spread
-from benchmarks.tables import filled
 from sags_node.config.schema import LaunchConfig
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging.content import STRAIN_FIELDS, points
@@ -25,6 +23,9 @@ STRAINED = 0.05  # strain from which on points are counted apart
 PULLED, BACK = 0.75, 0.8  # shares of the session: "all" ends; the tissue is back where it was
 ACROSS = 4  # vertices to each side of one, over which its true strain is taken: about 2 mm
 NEAR = 0.002  # m, largest distance from a point to the surface
+
+
+TABLES = ("known true_p90 error.median error.p90 bias zero.median zero.p90",)
 
 
 def measure_strain(seeds: int, advance: Advance) -> dict[str, Any]:
@@ -107,13 +108,3 @@ def _summary(found: F32, exact: F64) -> dict[str, Any]:
             "zero": spread(nothing),
         }
     return said
-
-
-def tables(measured: dict[str, Any]) -> list[Table]:
-    """Make the tables for people."""
-    table = Table("points", "strain", "known", "true, p90", "error", "0 is told", title="median, nine of ten")
-    for part in ("all", "strained", "back"):
-        for name, row in measured[part].items():
-            figures = "{error[median]}, {error[p90]}", "{zero[median]}, {zero[p90]}"
-            filled(table, [row], part, name, "{known}", "{true_p90}", *figures)
-    return [table]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import Advance
-from benchmarks.quality.followers import CONSISTENT, FOLLOWERS, Follower, dis_flow, sample
+from benchmarks.quality.followers import CONSISTENT, FOLLOWERS, dis_flow, sample
 from sags_lab.protocols.point_tracks import (
     average_jaccard,
     calibration_error,
@@ -56,6 +56,15 @@ class _Said:
     times_s: list[float] = field(default_factory=list)  # of every frame
 
 
+RELIABILITY = "least most count said right"  # of anchors that were that sure; also of `recall`
+TABLES = (
+    "frame motion_px.p50 motion_px.p90 anchors anchors_px.p50 anchors_px.p90 gaussians gaussians_px.p50"
+    " gaussians_px.p90",
+    "off_by_px.p50 off_by_px.p90 within.average sure wrong average_jaccard us_per_point",
+    RELIABILITY,
+)
+
+
 def measure_tracking(
     session: Session, frames: Sequence[int], advance: Advance, beside: Collection[str] = tuple(FOLLOWERS)
 ) -> dict[str, Any]:
@@ -67,12 +76,8 @@ def measure_tracking(
     within `CONSISTENT`. The frames between are not used. Points behind an instrument have no such truth.
 
     Args:
-        session: a recording.
         frames: after how many to measure.
         beside: names of `FOLLOWERS`, shown the same points and images.
-
-    Raises:
-        SagsError: the recording is too short, or nothing can be pinned.
     """
     prepare(session.config)
     pipeline, budget, last = Pipeline(session.config, session.rig), StepBudget(1), max(frames)
@@ -104,11 +109,7 @@ class _Run:
     def __init__(
         self, pipeline: Pipeline, frame: StereoFrame, result: FrameResult, beside: Collection[str]
     ) -> None:
-        """Pin anchors at true points that are seen, where the recording has any, else on a grid.
-
-        Raises:
-            SagsError: nothing can be pinned.
-        """
+        """Pin anchors at true points that are seen, where the recording has any, else on a grid."""
         self._first, self._flow = result, dis_flow()
         points = true_points(frame, result)
         self._exact = points is not None
@@ -134,7 +135,12 @@ class _Run:
         self._frame_s.append(sum(result.timings_ms.values()) * 1e-3)
         self._said["anchors"].times_s.append(result.timings_ms.get("anchors", 0.0) * 1e-3)
         for name, follower in self._followers.items():
-            _show(follower, self._said[name], result, measured)
+            started, said = time.perf_counter(), self._said[name]
+            pixels, seen = follower.follow(result.pair.left)
+            said.times_s.append(time.perf_counter() - started)
+            if measured:
+                said.pixels.append(pixels)
+                said.seen.append(seen)
         if measured:
             states = result.anchors
             self._states.append(states)
@@ -152,7 +158,11 @@ class _Run:
             direct.times_s.append(time.perf_counter() - started)
             direct.pixels.append(ends[self._shared])
             direct.seen.append(consistent[self._shared])
-            truth = self._truth(frame, result)
+            points = true_points(frame, result)
+            assert points is not None
+            points = points[self._rows]
+            places = np.asarray(project(result.pair.camera, points)[0], np.float64)
+            truth = _Truth(places, np.ones(len(points), np.bool_), _visible(frame)[self._rows], points)
         else:
             truth = _Truth(ends, consistent, consistent)
         self._truths.append(truth)
@@ -168,13 +178,6 @@ class _Run:
             "gaussians": int(sure.sum()),
             "gaussians_px": percentiles(np.linalg.norm(wanted - ended_at, axis=1)[sure]),
         }
-
-    def _truth(self, frame: StereoFrame, result: FrameResult) -> _Truth:
-        points = true_points(frame, result)
-        assert points is not None
-        points = points[self._rows]
-        pixels: F64 = np.asarray(project(result.pair.camera, points)[0], np.float64)
-        return _Truth(pixels, np.ones(len(points), np.bool_), _visible(frame)[self._rows], points)
 
     def figures(self) -> dict[str, Any]:
         """Return figures of all methods over all measured frames, and of the anchors' confidence."""
@@ -212,15 +215,6 @@ class _Run:
             "visibility_right": float(np.mean(seen == visible)) if self._exact else None,
             "us_per_point": float(np.median(said.times_s)) * 1e6 / points,
         }
-
-
-def _show(follower: Follower, said: _Said, result: FrameResult, measured: bool) -> None:
-    started = time.perf_counter()
-    pixels, seen = follower.follow(result.pair.left)
-    said.times_s.append(time.perf_counter() - started)
-    if measured:
-        said.pixels.append(pixels)
-        said.seen.append(seen)
 
 
 def reliability_rows(confidence: F64, right: Bool, in_sight: Bool) -> dict[str, Any]:
@@ -262,16 +256,11 @@ def middle(places: F64, result: FrameResult) -> Bool:
     return np.asarray(inside.all(1))
 
 
-NO_TISSUE = "no tissue with depth was found in the first frame; set source.start to a better one"
-
-
-def pin(
-    pipeline: Pipeline, result: FrameResult, places: F64, rows: I64, otherwise: str = NO_TISSUE
-) -> dict[int, int]:
+def pin(pipeline: Pipeline, result: FrameResult, places: F64, rows: I64) -> dict[int, int]:
     """Pin anchors at these rows of pixels [P, 2], where possible; return id -> row.
 
     Raises:
-        SagsError: `otherwise`, if none can be pinned.
+        SagsError: none can be pinned.
     """
     pinned, shown = dict[int, int](), (result.observation, result.snapshot, result.views["left"])
     for row in rows.tolist():
@@ -279,7 +268,7 @@ def pin(
         with suppress(SagsError):  # an instrument, or no depth there
             pinned[pipeline.anchors.add_pixel(u, v, *shown)] = row
     if not pinned:
-        raise SagsError(otherwise)
+        raise SagsError("no tissue with depth is there to pin anchors; set source.start or source.seed anew")
     return pinned
 
 

@@ -395,6 +395,7 @@ def costs(
     check_installed()
     from sags_lab.archive.costs import job_costs
     from sags_node.pipeline.session import open_session
+    from sags_node.tools.evaluation.figures import flat
 
     path, overrides = split_recording(launch, "live cameras have no length; name a recording")
     with open_session(path, [*overrides, "source.loop:=false"]).source as source:
@@ -408,10 +409,5 @@ def costs(
             str(Path(path).resolve()), overrides, asked, frames, rate,
             lambda done, job: advance(done, len(asked), job),
         )  # fmt: skip
-    show(rows if json_out else text.rows_table([_flat_cost(row) for row in rows]))
+    show(rows if json_out else text.rows_table([flat(row) for row in rows]))
     write_json(out, rows)
-
-
-def _flat_cost(row: dict[str, Any]) -> dict[str, Any]:
-    hour = {f"{name} of an hour": value for name, value in row["of_an_hour"].items()}
-    return {key: value for key, value in row.items() if key != "of_an_hour"} | hour

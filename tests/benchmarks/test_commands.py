@@ -6,12 +6,16 @@ from typing import Any
 from unittest.mock import ANY
 
 import cv2
+import numpy as np
 import pytest
-from command_line import figures_of, refused, sags
+from command_line import figures_of, ran, refused
 from places import ROOT, SESSION
 
 from benchmarks.__main__ import main
+from benchmarks.pareto import baselines
 from benchmarks.pareto import settings as pareto_settings
+from benchmarks.quality import methods
+from benchmarks.tables import tables
 
 # ---- what each says of a few frames ------------------------------------------------------------------------
 
@@ -27,7 +31,7 @@ def measured(tmp_path: Path, *arguments: object) -> Any:
 
 
 def test_kernels(tmp_path: Path) -> None:
-    table = measured(tmp_path, "kernels", "--quick", "--no-twin")
+    table = measured(tmp_path, "kernels", "--quick", "--contention")
     assert (tmp_path / "new/figures.svg").read_text().startswith("<?xml")
     rows = table["rasterize"]
     assert {row["scene"] for row in rows} == {"surface", "corner", "shuffled"}
@@ -35,18 +39,19 @@ def test_kernels(tmp_path: Path) -> None:
     assert pairs.keys() == {1.0, 0.5, 0.25, 0.1, 0.05} and 0.3 * pairs[1.0] < pairs[0.5] < 0.7 * pairs[1.0]
     for row in (row for section in ("rasterize", "losses", "adam") for row in table[section]):
         assert all(each["share_of_peak"] > 0 for each in (row, *row["stages"]))
-    assert "composite" in sags("kernels", "--quick", "--no-twin", command=main).stdout
+    assert table["contention"][0]["beside_busy_process_ms"]["p50"] > 0
 
 
 def test_pareto(phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pareto_settings, "BUDGETS_MS", (33.0, 20.0))
     monkeypatch.setattr(pareto_settings, "SIZES", (0.5,))
     fit = {"session": phantom_session.name, "seconds": 9.0, "gaussians": 800, "heldout": {"psnr": 41.0}}
-    (tmp_path / "fit.json").write_text(json.dumps(fit | {"depth": None}))
+    (tmp_path / "fit_phantom.json").write_text(json.dumps(fit | {"depth": None}))
+    (tmp_path / "fit_other.json").write_text(json.dumps(fit | {"session": "another"}))
+    monkeypatch.setattr(baselines, "RESULTS", tmp_path)
     plot = tmp_path / "pareto.png"
     asked = "mapping.max_gaussians:=2000 mapping.rung:=8 --frames 10 --only budgets,resolutions,skips".split()
-    asked += ["--fit", tmp_path / "fit.json", "--plot", plot]
-    found = measured(tmp_path, "pareto", phantom_session, *asked)
+    found = measured(tmp_path, "pareto", phantom_session, *asked, "--plot", plot)
     (session,) = found["sessions"]
     rows = {tuple(each["overrides"]): each for each in session["settings"]}
     default, half = rows[()], rows["vision.width:=160", "vision.height:=128"]
@@ -101,7 +106,6 @@ def test_endurance(tmp_path: Path) -> None:
     assert all(each["psnr"] > each["model_psnr"] for each in found["windows"])
     still = found["still"]
     assert still["settled"] < still["recognised"] <= still["frames"]
-    assert "per 1000 frames" in sags("endurance", SESSION, *asked, command=main).stdout
 
 
 def test_alias(tmp_path: Path) -> None:
@@ -114,14 +118,48 @@ def test_alias(tmp_path: Path) -> None:
     assert (tmp_path / "alias.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_methods(phantom_session: Path, tmp_path: Path) -> None:
+def test_methods(phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A field knows the last seconds, and nodes do not."""
-    rows = measured(tmp_path, "methods", phantom_session, "source.frames:=20", "mapping.max_gaussians:=6000")
-    for nodes, field in zip(rows[::2], rows[1::2], strict=True):
-        assert (nodes["method"], field["method"]) == ("nodes", "sags")
-        assert field["step"]["window"] > nodes["step"]["window"]
-        assert field["step"]["receipt"] == nodes["step"]["receipt"]
-        assert all(row["live"]["rate_hz"] > 0 for row in (nodes, field))
+    monkeypatch.setattr(methods, "SIZES", ((320, 256),))
+    asked = (phantom_session, "source.frames:=20", "mapping.max_gaussians:=6000")
+    nodes, field = measured(tmp_path, "methods", *asked)
+    assert (nodes["method"], field["method"]) == ("nodes", "sags")
+    assert field["step"]["window"] > nodes["step"]["window"]
+    assert field["step"]["receipt"] == nodes["step"]["receipt"]
+    assert all(row["live"]["rate_hz"] > 0 for row in (nodes, field))
+
+
+# ---- what it says to people --------------------------------------------------------------------------------
+
+
+def test_a_table_shows_the_keys_that_are_asked_for_wherever_they_lie() -> None:
+    row = {
+        "name": "fast",
+        "ms": {"p50": np.float32(1.23456), "p99.9": np.int64(7)},
+        "depth": None,
+        "size": [640, 512],
+    }
+    found = {"session": "a", "parts": {"one": [row], "two": [{"name": "slow", "size": []}]}, "size": 3}
+    by_name, below = tables(
+        found["parts"], "ms.p50 ms.p99.9 depth.p90_mm size name", "two: size name", "gone"
+    )
+    cells = [[*column.cells] for column in by_name.columns]
+    assert cells == [
+        ["one", "two"],
+        ["1.235", "-"],
+        ["7", "-"],
+        ["640, 512", "-"],
+        ["fast", "slow"],
+    ]
+    assert [column.header for column in by_name.columns][1:4] == ["ms p50", "ms p99 9", "size"]
+    assert [[*column.cells] for column in below.columns] == [["slow"]]
+    (inherited,) = tables([found], "session name")
+    assert [[*column.cells] for column in inherited.columns][1:] == [["a", "a"], ["fast", "slow"]]
+
+
+def test_a_command_prints_its_tables() -> None:
+    code, stdout, _ = ran("kernels", "--quick", command=main)
+    assert code == 0 and "composite backward" in stdout and "share of peak" in stdout
 
 
 # ---- mistakes ----------------------------------------------------------------------------------------------
@@ -135,7 +173,6 @@ PLAYED = "pareto depth disturbances endurance methods crowd thin tracking ablati
     [
         *((name, [LIVE], 2, "record the cameras first") for name in PLAYED),
         ("pareto", [SESSION, "--only", "budgets,speed"], 2, "unknown part 'speed'; choose from budgets"),
-        ("pareto", [SESSION, "--fit", "list.json"], 2, "holds no figures of a fit"),
         ("pareto", [SESSION, "--frames", 2, "--only", "budgets"], 1, "play more"),
         ("depth", ["--picture", "a.jpg"], 2, "add --ct FOLDER"),
         ("depth", [SESSION, "--faults"], 2, "give one of them"),
@@ -153,8 +190,6 @@ PLAYED = "pareto depth disturbances endurance methods crowd thin tracking ablati
         ("kernels", ["--check", "gone.json"], 2, "gone.json"),
         ("kernels", ["--check", "list.json"], 2, "holds no kernel times"),
         ("ablation", [SESSION, "source.frames:=4"], 1, "1 are left to learn from and 0 to test on"),
-        ("ablation", [SESSION, "source.start:=0.2", "source.frames:=9"], 1, "--hold-out"),
-        ("ablation", [SESSION, "--lpips-weights", "gone.npz"], 2, "gone.npz"),
         ("ablation", [SESSION, "--variant", "fuller"], 2, "full, no_block"),
         ("crowd", ["no_such_key:=1"], 2, "no_such_key"),
     ],
@@ -173,7 +208,7 @@ def test_a_wrong_call_says_why(
 
 
 WRITERS = [
-    *((name, "--out") for name in main.commands if name != "transport"),
+    *((name, "--out") for name in main.commands),
     *(("alias", "--picture"), ("pareto", "--plot")),
 ]
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from onnx_networks import save_matcher
 
-from benchmarks.quality import depth_report
 from benchmarks.quality.depth import (
     Comparison,
     Tally,
@@ -26,9 +25,6 @@ from sags_node.types import F32, U8, Bool, Camera, RectifiedPair
 WIDTH, HEIGHT, BASELINE, FOCAL = 320, 256, 0.0043, 285.0
 CAMERA = Camera(WIDTH, HEIGHT, np.array([[FOCAL, 0, 159.5], [0, FOCAL, 127.5], [0, 0, 1]]), np.eye(4))
 ALL = np.ones((HEIGHT, WIDTH), np.bool_)
-
-
-def silent(done: int, of: int | None, what: str) -> None: ...
 
 
 def shown_pair(disparity: F32, noise: float = 0.0) -> tuple[RectifiedPair, F32]:
@@ -138,7 +134,7 @@ def test_faults_make_depth_worse(tmp_path: Path) -> None:
     said = {"inputs": "[first, second]", "normalization": "bytes", "meaning": "disparity", "multiple": "32"}
     network = save_matcher(tmp_path / "blocks.onnx", metadata=said)
     faults = {"noise": (0.0, 0.08), "gloss": (0.0, 64.0)}
-    measured = measure_faults((256, 192), 1, faults, silent, network)
+    measured = measure_faults(lambda *_: None, network, (256, 192), 1, faults)
     clean, noisy, dull, shiny = measured["faults"]
     assert noisy["settings"][0]["median_mm"] > 1.3 * clean["settings"][0]["median_mm"]
     assert dull["white"] < 0.001 and shiny["white"] > 0.01
@@ -148,7 +144,6 @@ def test_faults_make_depth_worse(tmp_path: Path) -> None:
     assert blocks["name"] == "network blocks.onnx"
     assert blocks["coverage"] > 0.5
     assert 0 < blocks["median_mm"] < 3.3  # half a px of disparity at 80 mm, 230 px and 4.3 mm
-    assert [made.row_count for made in depth_report.tables(measured)] == [1 + len(clean["settings"])] * 2
 
 
 # ---- a CT surface ----------------------------------------------------------------------------------------

@@ -65,8 +65,7 @@ def changed(name: str, frames: list[StereoFrame], scene: Scene) -> Iterator[Ster
 
 
 def test_all_are_there() -> None:
-    assert list(DISTURBANCES) == NAMES.split()
-    assert all(each.name == name and each.says for name, each in DISTURBANCES.items())
+    assert [each.name for each in DISTURBANCES.values()] == list(DISTURBANCES) == NAMES.split()
 
 
 @pytest.mark.parametrize("name", NAMES.split())

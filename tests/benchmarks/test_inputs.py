@@ -14,7 +14,7 @@ def test_what_a_pair_costs_is_measured(way: str) -> None:
         need_gstreamer()
     if way == "ros2":
         pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install '.[ros2]'")
-    (row,) = measure_inputs(0.5, way, lambda done, total: None)
+    (row,) = measure_inputs(0.5, way, lambda *_: None)
     assert row["way"] == way and row["unequal"] == 0
     assert 0 < row["pairs"] <= 0.5 * RATE + 8  # more than come in that time only where some waited
     assert row["node_ms"] > 0 and row["sender_ms"] > 0

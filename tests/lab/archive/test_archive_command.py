@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_line import pure_json, refused, sags
+from command_line import figures_of, pure_json, refused, sags
 from tiny_archive import TINY_FRAMES
 
 from sags_lab.archive import cluster as cluster_module
@@ -29,20 +29,17 @@ def test_figures_are_those_of_sags_eval(cluster: Any, tiny_session: Path, tmp_pa
     assert (state["done"], state["quarantined"], state["missing"]) == (1, 1, 0)
 
     done, poison = (each.id for each in recordings)
-    shown = pure_json(sags("archive", "show", tmp_path / "out", done[:10], "--json").stdout)
+    shown = figures_of("archive", "show", tmp_path / "out", done[:10], "--json")
     try:
-        expected = evaluate(
-            tiny_session, ["engine.threads:=1", *SETTINGS], MeasureOptions(2, 2), "step", 1
-        ).summary
+        found = evaluate(tiny_session, ["engine.threads:=1", *SETTINGS], MeasureOptions(2, 2), "step", 1)
     finally:
         configure_threads(None)
     for group in ("online", "heldout", "depth", "track", "novel"):
-        for name, value in expected[group].items():
+        for name, value in found.summary[group].items():
             assert shown["figures"][f"{group}.{name}"] == value, (group, name)
     assert shown["state"] == "done" and shown["figures"]["settings.pace"] == "step"
-    assert (tmp_path / "out/recordings" / done / "report/report.html").is_file()
-
-    assert shown["log"].splitlines()[-1] == f"report: {tmp_path}/out/recordings/{done}/report/report.html"
+    report = tmp_path / "out/recordings" / done / "report/report.html"
+    assert report.is_file() and shown["log"].splitlines()[-1] == f"report: {report}"
 
     why = sags("archive", "show", tmp_path / "out", poison).stdout
     assert "quarantined" in why and "nowhere" in why and "sags eval /" in why
@@ -60,7 +57,7 @@ def test_episodes_become_a_data_set(cluster: Any, tiny_session: Path, tmp_path: 
         *("archive", "run", tmp_path / "m.csv", "--job", "lerobot", "--out", out, "--ray", cluster.address),
         "mapping.iterations:=1",
     )
-    shown = pure_json(sags("archive", "show", out, recordings[0].id, "--json").stdout)
+    shown = figures_of("archive", "show", out, recordings[0].id, "--json")
     assert (shown["state"], shown["figures"]["lerobot.holds"]) == ("done", 2)
     sags("archive", "dataset", out, dataset, "--lerobot-version", "v2.1")
     info = json.loads((dataset / "meta/info.json").read_text())
@@ -107,9 +104,9 @@ def test_a_start_counts_once_and_each_frame_the_same() -> None:
 
 def test_the_command_measures_a_recording(tiny_session: Path) -> None:
     asked = ("--job", "depth", "--frames", TINY_FRAMES, "--json")
-    rows = pure_json(sags("archive", "costs", tiny_session, "mapping.iterations:=1", *asked).stdout)
-    assert [(row["job"], row["frames"], row["seconds_of_video"]) for row in rows] == [("depth", 6, 0.6)]
-    assert rows[0]["cpu_s"] > 0.1 and rows[0]["peak_mb"] > 50
+    (row,) = figures_of("archive", "costs", tiny_session, "mapping.iterations:=1", *asked)
+    assert (row["job"], row["frames"], row["seconds_of_video"]) == ("depth", 6, 0.6)
+    assert row["cpu_s"] > 0.1 and row["peak_mb"] > 50
     pictures = 2 * 160 * 128 * TINY_FRAMES  # bytes, before they are compressed
-    assert 0 < rows[0]["bytes"] < pictures + 10_000
+    assert 0 < row["bytes"] < pictures + 10_000
     refused(2, "archive", "costs", tiny_session, "--frames", 7, said=("7 frames", "has 6", "--frames"))

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from places import HELPERS
 from small_disk import small_disk
 from tiny_archive import quick_plan, quick_work, table, write_quick_recordings
 from waiting import until
@@ -64,13 +65,13 @@ def begun(signs: Path, recording: Recording) -> int:
     return int(until(lambda: sorted(signs.glob(f"{name}.*")))[-1].suffix[1:])
 
 
-def parent_of(process: int) -> int:
-    return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
+def state_and_parent(process: int) -> list[str]:
+    return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[:2]
 
 
 def is_alive(process: int) -> bool:
     try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+        return state_and_parent(process)[0] != "Z"
     except OSError:
         return False
 
@@ -143,7 +144,7 @@ def test_a_killed_worker_and_a_lost_machine(cluster: Any, tmp_path: Path) -> Non
 
     def kill() -> None:
         first = begun(signs, recordings[0])
-        os.kill(parent_of(first), signal.SIGKILL)  # Ray's worker
+        os.kill(int(state_and_parent(first)[1]), signal.SIGKILL)  # Ray's worker
         until(lambda: not is_alive(first))
         second = until(
             lambda: next((each for each in signs.glob("r000.*") if int(each.suffix[1:]) != first), None)
@@ -192,12 +193,8 @@ def test_a_killed_driver_and_ctrl_c(cluster: Any, tmp_path: Path, how: signal.Si
     recordings = write_quick_recordings(tmp_path / "in", 5, signs=str(signs))
     change(recordings[3], waits_for=str(marker))
     recordings = [replace(each, weight=10.0 - number) for number, each in enumerate(recordings)]
-    code = DRIVER.format(
-        helpers=str(Path(__file__).parents[2] / "helpers"),
-        out=str(tmp_path / "out"),
-        folder=str(tmp_path / "in"),
-        address=cluster.address,
-    )
+    out, folder = str(tmp_path / "out"), str(tmp_path / "in")
+    code = DRIVER.format(helpers=str(HELPERS), out=out, folder=folder, address=cluster.address)
     driver = subprocess.Popen([sys.executable, "-c", code], start_new_session=True)
     try:
         stuck = begun(signs, recordings[3])

@@ -6,13 +6,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command_line import pure_json, sags
+from command_line import figures_of
 from tiny_archive import TINY_FRAMES
 from user_files import write_video
 
-from sags_lab.archive.launching import arguments, counterpart
+from sags_lab.archive.launching import arguments, counterpart, split
 from sags_lab.archive.manifest import Recording, beside, read_manifest, write_manifest
-from sags_lab.archive.scan import scan
+from sags_lab.archive.scan import Scan, scan
 from sags_node.errors import UsageError
 from sags_node.pipeline.session import open_session
 
@@ -47,8 +47,12 @@ def archive(tiny_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return folder
 
 
-def test_all_that_can_be_played_is_found_and_the_rest_explained(archive: Path) -> None:
-    found = scan(archive)
+@pytest.fixture(scope="module")
+def found(archive: Path) -> Scan:
+    return scan(archive)
+
+
+def test_all_that_can_be_played_is_found_and_the_rest_explained(found: Scan) -> None:
     assert {each.name: each.overrides for each in found.recordings} == {
         "case1/scope_left.mp4": ("source.kind:=videos",),
         "case2/both.mp4": ("source.kind:=videos", "source.geometry.layout:=side_by_side"),
@@ -62,18 +66,18 @@ def test_all_that_can_be_played_is_found_and_the_rest_explained(archive: Path) -
     assert "record them first" in why["case5/live.yaml"]
 
 
-def test_what_was_found_plays_with_both_eyes(archive: Path) -> None:
-    for recording in scan(archive).recordings:
+def test_what_was_found_plays_with_both_eyes(found: Scan) -> None:
+    for recording in found.recordings:
         rig = None if recording.rig is None else Path(recording.rig)
-        said = arguments(Path(recording.place), rig, recording.overrides)
-        launch = next((each for each in said if ":=" not in each), None)
-        with open_session(launch, [each for each in said if ":=" in each]).source as source:
+        with open_session(
+            *split(arguments(Path(recording.place), rig, recording.overrides))
+        ).source as source:
             frame = next(iter(source))
         assert frame.right is not None and not np.array_equal(frame.left, frame.right), recording.name
 
 
-def test_a_longer_recording_weighs_more(archive: Path) -> None:
-    weights = {each.name: each.weight for each in scan(archive).recordings}
+def test_a_longer_recording_weighs_more(found: Scan) -> None:
+    weights = {each.name: each.weight for each in found.recordings}
     assert weights["case4"] == pytest.approx(weights["case3"] * TINY_FRAMES / FRAMES, rel=1e-3)
 
 
@@ -99,8 +103,7 @@ def test_a_manifest_reads_as_it_was_written(tmp_path: Path, suffix: str) -> None
     )
     read = read_manifest(f"{folder}/m.{suffix}")
     assert read == recordings
-    assert read[0].place == f"{folder}/case 1/a.mp4"
-    assert read[1].place == "s3://bucket/b.mcap"
+    assert [each.place for each in read] == [f"{folder}/case 1/a.mp4", "s3://bucket/b.mcap"]
 
 
 @pytest.mark.parametrize(
@@ -148,12 +151,11 @@ def test_a_video_that_does_not_say_how_is_refused(tmp_path: Path) -> None:
     assert f"source.left:={tmp_path}/a.mp4" in said
 
 
-def test_the_command_leaves_a_manifest(archive: Path, tmp_path: Path) -> None:
-    result = sags("archive", "scan", archive, "--out", tmp_path / "m.csv", "--json")
-    said = pure_json(result.stdout)
+def test_the_command_leaves_a_manifest(archive: Path, found: Scan, tmp_path: Path) -> None:
+    said = figures_of("archive", "scan", archive, "--out", tmp_path / "m.csv", "--json")
     read = read_manifest(str(tmp_path / "m.csv"))
     assert [each["id"] for each in said["recordings"]] == [each.id for each in read]
-    assert [each.place for each in read] == [each.place for each in scan(archive).recordings]
+    assert [each.place for each in read] == [each.place for each in found.recordings]
     assert read[0].rig == str(archive / "calib")  # found from where the manifest lies
     assert len(said["refused"]) == 3
 

@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from command_line import pure_json, refused, sags
+from command_line import figures_of, refused, sags
 from dvrk_files import frame_record, write_session
 from tiny_archive import TINY_FRAMES
 
@@ -140,7 +140,7 @@ def test_the_warm_up_is_played_and_not_counted(tiny_session: Path, tmp_path: Pat
     shown = [[row.figures["online"]["psnr"] for row in run.rows[-4:]] for run in (whole, part)]
     assert shown[0] == shown[1]
     asked = ("--pace", "step", "--warm-up", 2, "--hold-out", 0, "--json")
-    assert pure_json(sags("eval", tiny_session, *STEPS, *asked).stdout)["online"] == part.summary["online"]
+    assert figures_of("eval", tiny_session, *STEPS, *asked)["online"] == part.summary["online"]
     cold = evaluate(tiny_session, [*STEPS, "source.start:=0.2"], MeasureOptions(0, 2), "step")
     configure_threads(None)
     assert cold.rows[0].frame_id == 2
@@ -150,12 +150,9 @@ def test_the_warm_up_is_played_and_not_counted(tiny_session: Path, tmp_path: Pat
 def test_exports_leave_the_warm_up_out(tiny_session: Path, tmp_path: Path) -> None:
     pytest.importorskip("pyarrow", reason="the extra archive is not installed")
     said = ("source.start:=0.1", "source.warm_up:=2", "source.frames:=4", *STEPS)
-    made = pure_json(
-        sags(
-            *("export", tiny_session, *said, "--depth", tmp_path / "depth"),
-            *("--tracks", tmp_path / "t.npz", "--render", tmp_path / "m.mp4"),
-            *("--lerobot", tmp_path / "lerobot", "--json"),
-        ).stdout
+    made = figures_of(
+        *("export", tiny_session, *said, "--depth", tmp_path / "depth", "--tracks", tmp_path / "t.npz"),
+        *("--render", tmp_path / "m.mp4", "--lerobot", tmp_path / "lerobot", "--json"),
     )
     configure_threads(None)
     holds = {row["kind"]: row["holds"] for row in made}
@@ -175,9 +172,8 @@ def test_an_archive_of_segments(tiny_session: Path, tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     (tmp_path / "in/case").symlink_to(tiny_session)
     manifest = tmp_path / "m.csv"
-    result = sags(
-        "archive", "scan", tmp_path / "in", "--out", manifest, "--segment", "0.3", "--warm-up", "0.1"
-    )
+    cut = ("--segment", "0.3", "--warm-up", "0.1")
+    result = sags("archive", "scan", tmp_path / "in", "--out", manifest, *cut)
     assert "1 recordings in 2 rows" in result.stderr
     rows = read_manifest(str(manifest))
     assert [row.segment for row in rows] == ["0-2", "3-end"]

@@ -15,14 +15,8 @@ def test_stir_counts_the_nearest_end_up_to_and_with_each_threshold() -> None:
     distances = arithmetic.nearest_distances(points, ends)
     assert distances.tolist() == [5.0, 4.0, 50.0, 90.0]
     shares = shares_within(distances, arithmetic.STIR_PX)
-    assert shares == {
-        "within_4": 0.25,
-        "within_8": 0.5,
-        "within_16": 0.5,
-        "within_32": 0.5,
-        "within_64": 0.75,
-        "average": 0.5,
-    }
+    found = {"within_4": 0.25, "within_8": 0.5, "within_16": 0.5, "within_32": 0.5, "within_64": 0.75}
+    assert shares == found | {"average": 0.5}
     millimetres = shares_within(np.array([1.0, 3.0]), (2, 4, 8, 16, 32))
     assert millimetres["average"] == pytest.approx((0.5 + 4 * 1.0) / 5)
 
@@ -179,12 +173,8 @@ def test_stereomis_tracks_by_hand() -> None:
 def test_reliability_tells_what_was_said_from_what_was_right() -> None:
     confidence = np.array([0.0, 0.1, 0.55, 0.95, 1.0, 0.9, 0.99])
     bins = reliability(confidence, np.array([0, 1, 1, 1, 1, 0, 1], bool))
-    assert [(each.least, each.most, each.count) for each in bins] == [
-        (0, 0.02, 1),
-        (0.1, 0.2, 1),
-        (0.5, 0.6, 1),
-        (0.9, 1, 4),
-    ]
+    counted = [(each.least, each.most, each.count) for each in bins]
+    assert counted == [(0, 0.02, 1), (0.1, 0.2, 1), (0.5, 0.6, 1), (0.9, 1, 4)]
     assert [each.right for each in bins] == [0, 1, 1, 0.75]
     assert bins[3].said == pytest.approx(0.96)
     assert calibration_error(bins) == pytest.approx((0.9 + 0.45 + 4 * 0.21) / 7)

@@ -135,9 +135,8 @@ def test_the_population_asks_no_stereo(d4d: Path, tmp_path: Path) -> None:
     back = np.eye(4)
     back[2, 3] = -0.03
     np.savetxt(session / "clips/Clip_1/curated_camera_pose_end.txt", scanner_pose() @ back)
-    found = figures_of(
-        "eval", "--protocol", "d4d", str(tmp_path), "--iterations", "1", "vision.pose:=session", "--json"
-    )
+    asked = ("--iterations", 1, "vision.pose:=session", "--json")
+    found = figures_of("eval", "--protocol", "d4d", tmp_path, *asked)
     assert (found["scans"], found["refused"]) == (1, 1)
     assert found["end"] == {} and found["start"]["visible"]["measured"]["median_mm"] < 1
     population = found["population"]

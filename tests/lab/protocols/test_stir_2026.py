@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 from command_line import figures_of, refused
 from numbered_pictures import write_video
-from places import SESSION
 
 from sags_lab.protocols.stir_2026 import stir_2026_sequences
 from sags_node.errors import UsageError
 from sags_node.geometry import project
-from sags_node.rig import load_rig
 from sags_node.types import StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier
 
@@ -58,9 +56,8 @@ def stir(tmp_path_factory: pytest.TempPathFactory, rig: StereoRig, played: list[
     return folder.parent
 
 
-def test_a_sequence_of_2026(stir: Path) -> None:
+def test_a_sequence_of_2026(stir: Path, rig: StereoRig) -> None:
     (sequence,) = stir_2026_sequences(stir)
-    rig = load_rig(SESSION / "calib")
     assert sequence.rig.baseline == pytest.approx(rig.baseline) and tuple(sequence.truth) == KNOWN
     first = sequence.truth[0]
     np.testing.assert_array_equal(sequence.queries, first.left)
@@ -68,26 +65,16 @@ def test_a_sequence_of_2026(stir: Path) -> None:
 
 
 def test_a_point_must_be_seen_by_both_eyes(stir: Path, tmp_path: Path) -> None:
-    folder = copied(stir, tmp_path)
-    change(folder, "annotations.json", "4/0", left_visibility=[1, 1, 0, 0], right_visibility=[1, 0, 1, 0])
-    row = json.loads((folder / "annotations.json").read_text())["4/0"]
+    folder = Path(shutil.copytree(stir / "00", tmp_path / "00"))
+    said = json.loads((folder / "annotations.json").read_text())
+    row = said["4/0"]
+    row["left_visibility"][:4], row["right_visibility"][:4] = [1, 1, 0, 0], [1, 0, 1, 0]
+    (folder / "annotations.json").write_text(json.dumps(said))
     (sequence,) = stir_2026_sequences(folder)
     truth = sequence.truth[4]
     assert truth.in_left[:4].tolist() == [True, True, False, False]
     assert truth.in_both[:4].tolist() == [True, False, False, False]
     assert truth.right[0].tolist() == [row["left_x"][0] - row["disparity"][0], row["left_y"][0]]
-
-
-def copied(stir: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(stir / "00", tmp_path / "00"))
-
-
-def change(folder: Path, name: str, key: str, **values: list[int]) -> None:
-    """Put values in the place of the first ones of a frame."""
-    said = json.loads((folder / name).read_text())
-    for what, new in values.items():
-        said[key][what][: len(new)] = new
-    (folder / name).write_text(json.dumps(said))
 
 
 def test_stir_2026_end_to_end(stir: Path) -> None:
@@ -104,21 +91,16 @@ def test_stir_2026_end_to_end(stir: Path) -> None:
 
 
 def test_without_what_follows_the_first_frame_nothing_is_measured(stir: Path) -> None:
-    said = ("no annotated frame after the first", "source.frames")
-    refused(1, "eval", "--protocol", "stir", str(stir), "source.frames:=2", said=said)
-    refused(
-        2,
-        "eval",
-        "--protocol",
-        "stir",
-        str(stir),
-        "source.start:=0.2",
-        said=("source.start: points are marked",),
+    command, said = (
+        ("eval", "--protocol", "stir", stir),
+        ("no annotated frame after the first", "source.frames"),
     )
+    refused(1, *command, "source.frames:=2", said=said)
+    refused(2, *command, "source.start:=0.2", said=("source.start: points are marked",))
 
 
 def test_wrong_files_of_2026(stir: Path, tmp_path: Path) -> None:
-    folder = copied(stir, tmp_path)
+    folder = Path(shutil.copytree(stir / "00", tmp_path / "00"))
     queries, truth = folder / "queries.json", folder / "annotations.json"
     good = queries.read_text()
     for text, said in (
