@@ -29,8 +29,8 @@ FOLDERS = sorted(PLACES)
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 10079,
-    "sags_lab": 5022,
+    "benchmarks": 9192,
+    "sags_lab": 5007,
     "sags_node": 1304,
     "sags_node/bags": 1001,
     "sags_node/cli": 3619,
@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1940,
     "sags_node/tools/importing": 1169,
     "sags_node/vision": 5378,
-    "tests": 46959,
+    "tests": 46732,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -173,10 +173,13 @@ def bench_ablation(
 @click.command("gpu")
 @shown("--device", type=click.Choice(["cuda", "cpu"]), default="cuda", help="cpu: Warp's, which is slow.")
 @click.option("--small", is_flag=True, help="Tiny sizes: does it work, not how fast is it.")
+@shown("--schedule", type=click.Choice(["paper", "released"]), default="paper", help="Of the fit.")
 @shown("--seconds", type=click.FloatRange(min=1), default=480.0, help="After which no part begins.")
 @click.option("--part", help="Only this one, in this process; prints JSON.")
 @figures_option
-def bench_gpu(device: str, small: bool, seconds: float, part: str | None, out: Path | None) -> None:
+def bench_gpu(
+    device: str, small: bool, schedule: str, seconds: float, part: str | None, out: Path | None
+) -> None:
     """Check all that a GPU should do: parity, times, a fit, live runs. `make gpu-check` calls it.
 
     \b
@@ -185,11 +188,11 @@ def bench_gpu(device: str, small: bool, seconds: float, part: str | None, out: P
     """
     from benchmarks.gpu.check import gpu_check, parts, run_part, table
 
-    chosen = parts(small)
+    chosen = parts(small, schedule)
     if part is not None:
         if part not in chosen:
             raise UsageError(f"there is no part {part!r}: choose one of {', '.join(chosen)}")
-        click.echo(json.dumps(run_part(part, device, small)))
+        click.echo(json.dumps(run_part(part, device, small, schedule)))
         return
     check_files(out)
 
@@ -198,7 +201,8 @@ def bench_gpu(device: str, small: bool, seconds: float, part: str | None, out: P
         name = [*figures][-1]
         click.echo(f"{name}: {figures[name].get('error', 'done')}", err=True)
 
-    figures = gpu_check(["--device", device, *["--small"] * small], chosen, keep, seconds)
+    arguments = ["--device", device, "--schedule", schedule, *["--small"] * small]
+    figures = gpu_check(arguments, chosen, keep, seconds)
     show(table(figures, chosen))
     if failed := [name for name, found in figures.items() if "error" in found]:
         raise SagsError(f"failed: {', '.join(failed)}; what they said is above")

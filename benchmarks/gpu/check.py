@@ -90,29 +90,33 @@ class Part:
     limit: float = 120.0
 
 
-def parts(small: bool) -> dict[str, Part]:
+def parts(small: bool, schedule: str) -> dict[str, Part]:
     """The parts by their names, in their order: first what has a goal. `small`: tiny sizes."""
     found = {"environment": Part(environment, limit=180.0)}
     for count, size in ((200, (96, 80)),) if small else ((2_000, (150, 117)), (100_000, (640, 512))):
         found[f"parity {count}"] = Part(partial(parity, count, *size), PARITY)
     counts, sizes, runs = ((300,), ((64, 48),), 1) if small else (COUNTS, SIZES, 21)
     drawn = {
-        f"{count} at {size[0]}x{size[1]}": Part(
+        f"draw {count} at {size[0]}x{size[1]}": Part(
             partial(speed, count, *size, runs), SPEED_GOAL if (count, size) == (100_000, SIZES[0]) else SPEED
         )
         for size in sizes
         for count in counts
     }
-    goal = f"{counts[min(2, len(counts) - 1)]} at {sizes[0][0]}x{sizes[0][1]}"
+    goal = f"draw {counts[min(2, len(counts) - 1)]} at {sizes[0][0]}x{sizes[0][1]}"
     found[goal] = drawn.pop(goal)
-    found["fit paper"] = Part(partial(fit, SMALL_FIT if small else [D4D]), FIT_GOAL, 360.0)
+    found[f"fit {schedule}"] = Part(
+        partial(fit, SMALL_FIT if small else [D4D], schedule),
+        FIT_GOAL if schedule == "paper" else FIT_GOAL[1:],
+        360.0,
+    )
     for name, arguments in LIVE.items():
         goals = FAST_GOAL if name == "D4D, 60 Hz" else LIVE_GOAL
         found[f"live {name}"] = Part(partial(live, SMALL_LIVE if small else arguments), goals)
     return found | drawn
 
 
-def run_part(name: str, device_name: str, small: bool) -> Row:
+def run_part(name: str, device_name: str, small: bool, schedule: str) -> Row:
     """Run a part in this process; "cpu": Warp's CPU device stands in for a GPU."""
     if device_name == "cpu":
         for module, function, found in (
@@ -121,7 +125,7 @@ def run_part(name: str, device_name: str, small: bool) -> Row:
             (fit_folder, "device_of", "cpu"),
         ):
             setattr(module, function, lambda *_, found=found: found)
-    return parts(small)[name].run()
+    return parts(small, schedule)[name].run()
 
 
 def gpu_check(
@@ -217,9 +221,9 @@ def live(arguments: list[str]) -> Row:
     return _sags("figures.json", LIVE_FIGURES, "eval", *arguments, "device:=cuda")
 
 
-def fit(arguments: list[str]) -> Row:
-    """Fit on the GPU by the paper's schedule and return its figures."""
-    return _sags("fit/figures.json", FIT_FIGURES, "fit", *arguments, "--schedule", "paper", "device:=cuda")
+def fit(arguments: list[str], schedule: str) -> Row:
+    """Fit on the GPU and return its figures."""
+    return _sags("fit/figures.json", FIT_FIGURES, "fit", *arguments, "--schedule", schedule, "device:=cuda")
 
 
 def _sags(written: str, names: tuple[str, ...], *arguments: str) -> Row:
