@@ -3,6 +3,7 @@ definition, views, threads and wrong use."""
 
 import dataclasses
 import math
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -205,6 +206,20 @@ def test_a_view_has_its_own_memory() -> None:
     assert view.depth.min() == view.depth.max() == pytest.approx(0.0625)
 
 
+def test_what_several_ask_for_at_once_is_enlarged_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls, resize = [], cv2.resize
+
+    def slow(*args: Any, **named: Any) -> Any:
+        calls.append(time.sleep(0.1))  # long enough for the others to come meanwhile
+        return resize(*args, **named)
+
+    view = to_view(np.ones((5, HEIGHT // 2, WIDTH // 2), np.float32), camera(WIDTH, HEIGHT), 0, 0)
+    monkeypatch.setattr(cv2, "resize", slow)
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: view.rgb, range(4), timeout=60))
+    assert len(calls) == 1 and all(each is found[0] for each in found)
+
+
 # ---- sharing the work --------------------------------------------------------------------------------------
 
 
@@ -249,6 +264,8 @@ def test_beside_others_one_core_is_left_for_kernels_and_for_opencv() -> None:
 
 
 # ---- wrong use ---------------------------------------------------------------------------------------------
+
+
 def test_wrong_input_is_explained() -> None:
     gaussians = scene(5)
     v_planes, weight = cotangents(WIDE, 0)
