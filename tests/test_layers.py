@@ -51,7 +51,7 @@ LINES = {
     "sags_node/media": 909,
     "sags_node/messaging": 5369,
     "sags_node/model": 1077,
-    "sags_node/node": 1837,
+    "sags_node/node": 1843,
     "sags_node/phantom": 1552,
     "sags_node/pipeline": 921,
     "sags_node/quality": 263,
@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1940,
     "sags_node/tools/importing": 1169,
     "sags_node/vision": 5378,
-    "tests": 46749,
+    "tests": 46755,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

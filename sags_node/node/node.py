@@ -10,6 +10,7 @@ take no more of a core than `allowance` says.
 """
 
 import logging
+import math
 import os
 import threading
 import time
@@ -57,6 +58,7 @@ HEALTH_PERIOD = 1.0  # s between two health messages
 STOP_SECONDS = 10.0  # longest wait for all threads to end
 LAST_WORDS = 1.0  # s to wait for the last health message, where another thread hangs
 REQUEST_WAIT = 0.05  # s between looks for requests while no frames come
+LOOKS_AGAIN = 5.0  # s: who asks for single images comes again in this time, and finds the next one ready
 
 OnResult = Callable[[FrameResult, float], None]  # a published result and its latency, ms
 
@@ -118,7 +120,8 @@ class Node:
         # By name, the newest only; None: closed. Single operations on a dict need no lock.
         self._drawn: dict[str, DrawnView | None] = {}
         self._watched: frozenset[str] = frozenset()  # views that somebody subscribes to
-        self._left_is_watched = False  # somebody looks at the left view
+        self._left_is_watched = False  # somebody looks at the left view, or did lately
+        self._left_looked_at = -math.inf  # when somebody did (s, monotonic)
         self._right_is_watched = False  # somebody looks at the right eye
         self._instruments_asked = False
         self._error: BaseException | None = None
@@ -399,7 +402,10 @@ class Node:
     def _note_who_looks(self) -> None:
         views = self._state.views
         self._watched = frozenset(name for name in views.status if self._publisher.watches_view(name))
-        self._left_is_watched = self._publisher.looked_at("left/render/image")
+        now = time.monotonic()
+        if self._publisher.looked_at("left/render/image"):
+            self._left_looked_at = now
+        self._left_is_watched = now < self._left_looked_at + LOOKS_AGAIN
         self._instruments_asked = self._publisher.wanted("instruments")
         if self._state.config.publish.right == "auto":
             pictures = ["right/render/image", *(f"view/{name}/right/image" for name in views.pairs)]

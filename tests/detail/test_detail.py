@@ -1,6 +1,7 @@
 """Detail of images in views: the kernel beside its twin, what is learnt, remembered and shown."""
 
 import itertools
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -346,7 +347,10 @@ def test_the_left_render_is_the_picture_where_tissue_is_seen_and_says_how_old_th
         until(lambda: control.request("get_status")["gaussians"], START_SECONDS)
         control.request("open_view", {"name": "later", "ahead_ms": 30, "rate_hz": 30})
         got = client.collect(node.data, [RENDER, INPUT, MASK, DEPTH, VIEW], 20, START_SECONDS)
+        time.sleep(0.5)  # in which nobody looks; `sags view` takes single images so
+        (again, *_) = client.collect(node.data, [RENDER], 1, START_SECONDS)[RENDER]
     assert node.stop() == 0, node.said()
+    assert "detail_age_ns" in again.meta
     # A frame that was begun before anybody looked is the model alone, and says nothing of images.
     got[RENDER] = [one for one in got[RENDER] if "detail_age_ns" in one.meta]
     assert len(got[RENDER]) > 10
