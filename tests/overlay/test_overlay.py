@@ -91,11 +91,12 @@ class Watcher(Subscriber):
         deadline, last = time.monotonic() + seconds, None
         while len(found) < count:
             assert time.monotonic() < deadline, self.status()
-            last = self.wait(LEFT, 0.1, after=last)
-            if not isinstance(last, ReceivedImage) or bool(last.array.any()) != drawn:
+            newest = self.wait(LEFT, 0.1, after=last)
+            last = newest or last  # None: none came yet
+            if not isinstance(newest, ReceivedImage) or bool(newest.array.any()) != drawn:
                 continue
-            whole = self.aligned(TOPICS, last.stamp_ns, 0.2 if drawn else 0)
-            found.append(dict(whole) if whole else {LEFT: last})  # type: ignore[arg-type]  # images
+            whole = self.aligned(TOPICS, newest.stamp_ns, 0.2 if drawn else 0)
+            found.append(dict(whole) if whole else {LEFT: newest})  # type: ignore[arg-type]  # images
         return found
 
     def newest_epoch(self) -> int:
