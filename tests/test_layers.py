@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1940,
     "sags_node/tools/importing": 1169,
     "sags_node/vision": 5378,
-    "tests": 46756,
+    "tests": 46765,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

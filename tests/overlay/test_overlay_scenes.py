@@ -171,6 +171,8 @@ def test_a_mesh_without_an_end_mark_that_may_have_broken_off_is_warned_of(
         ("objects: [{shape: target, colour: [1, 2, 3]}]", "'objects.0.colour'; did you mean 'color'?"),
         ("object: []", "did you mean 'objects'?"),
         ("objects: []", "objects: "),
+        ("[1, 2]", "should be a section of keys (got [1, 2])"),
+        ("objects: [", "not valid YAML"),
         ("objects: [{color: [1, 2, 3]}]", "needs a file, a shape or a label"),
         ("objects: [{shape: target, file: a.ply}]", "a file or a shape, not both"),
         ("objects: [{shape: cube}]", "'target' or 'sphere'"),
