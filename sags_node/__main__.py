@@ -47,6 +47,9 @@ def main() -> None:
         sags()
     except SystemExit as ended:
         code = ended.code
+        # Python remembers a Ctrl-C inside `exec` of a text, even one that was caught, until the next text:
+        # `python -m` would end as killed by SIGINT.
+        exec("")
         raise
 
 

@@ -31,7 +31,7 @@ FOLDERS = sorted(PLACES)
 LINES = {
     "benchmarks": 9192,
     "sags_lab": 5007,
-    "sags_node": 1304,
+    "sags_node": 1307,
     "sags_node/bags": 1001,
     "sags_node/cli": 3619,
     "sags_node/clients": 1,
@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1940,
     "sags_node/tools/importing": 1169,
     "sags_node/vision": 5378,
-    "tests": 46765,
+    "tests": 46788,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -233,6 +233,29 @@ def test_a_thread_that_is_given_up_does_not_abort_the_process() -> None:
     assert (ended.returncode, ended.stdout, ended.stderr) == (7, "said", "")
 
 
+CAUGHT = """
+import sys
+import sags_node.cli.main
+from sags_node.__main__ import main
+
+def command():
+    try:
+        exec("raise KeyboardInterrupt")  # as where `dataclasses` writes a class
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+sags_node.cli.main.main = command
+main()
+"""
+
+
+def test_a_ctrl_c_that_was_caught_is_no_death_by_a_signal(tmp_path: Path) -> None:
+    (tmp_path / "caught.py").write_text(CAUGHT)
+    command = [sys.executable, "-m", "caught"]
+    where = os.environ | {"PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"}
+    assert subprocess.run(command, timeout=START_SECONDS, check=False, env=where).returncode == 130
+
+
 @pytest.fixture
 def stop() -> Iterator[threading.Event]:
     """Set by Ctrl-C, as in commands that run until then."""
