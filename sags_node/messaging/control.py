@@ -54,7 +54,7 @@ class Request(msgspec.Struct, frozen=True):
     args: dict[str, Any] = msgspec.field(default_factory=dict)
     # How long its sender waits. A request that has not begun by then is not carried out. On the same machine
     # also by the wall clock: a node whose process was stopped does not know for how long.
-    within_s: float | None = None
+    within_s: Annotated[float, msgspec.Meta(ge=-1e308)] | None = None  # which NaN is not
     until_ns: int | None = None
 
     @property

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import resource
 import time
 from collections.abc import Mapping, Sequence
@@ -13,12 +14,13 @@ from typing import Any
 import msgspec
 import zmq
 
-from sags_node.config.schema import PublishConfig
+from sags_node.config.schema import NAMESPACE, PublishConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr, content, control, topics
 from sags_node.messaging.cdr import Content, type_hash
 from sags_node.messaging.node_clock import stamps
 from sags_node.messaging.peers import Peers
+from sags_node.messaging.requests import without_args
 from sags_node.messaging.rundir import Connection, RunDirectory
 from sags_node.messaging.security import Gate, RateLimitedLog, authenticated, check_endpoint
 from sags_node.messaging.sockets import Closes, bind, limit, waiting
@@ -109,6 +111,8 @@ class Publisher(Closes):
         self._kept: dict[str, _Value] = {}  # last values that no `FrameResult` holds
         self._peers: dict[str, Peers] = {}
         self._resources = ExitStack()
+        if not re.fullmatch(NAMESPACE, ns):
+            raise UsageError(f"'{ns}' is no namespace: letters, digits and _, parts of it separated by /")
         self._run = RunDirectory(config.run_dir, ns)
         self._has_ipc = config.ipc
         self._next_look = 0.0  # at the run directory
@@ -120,7 +124,7 @@ class Publisher(Closes):
         self._context = zmq.Context()
         try:
             gate = self._resources.enter_context(authenticated(self._context, config))
-            always = {"ping": lambda args: "pong", "get_clock": lambda args: stamps()}
+            always = {"ping": without_args(lambda: "pong"), "get_clock": without_args(stamps)}
             self._bind(config, gate, {**always, **(handlers or {})})
         except BaseException:
             self.close()

@@ -1,7 +1,7 @@
 """The `args` of the control operations that consumers ask for, and their checks."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
@@ -120,6 +120,16 @@ class ViewRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return K
 
 
+class SaveRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`save_model`: the file to write."""
+
+    path: str
+
+
+class _Nothing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What an operation without arguments takes."""
+
+
 class ViewName(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """`close_view`: a view by its name."""
 
@@ -136,6 +146,16 @@ def parse(kind: type[R], args: Mapping[str, Any]) -> R:
         return msgspec.convert(dict(args), kind)
     except (msgspec.ValidationError, RecursionError) as error:
         raise SagsError(str(error).replace("$.", "")) from None
+
+
+def without_args(work: Callable[[], Any]) -> Callable[[Mapping[str, Any]], Any]:
+    """Make the handler of an operation without arguments, which would have no effect: they are refused."""
+
+    def handle(args: Mapping[str, Any]) -> Any:
+        parse(_Nothing, args)
+        return work()
+
+    return handle
 
 
 def _matrix(rows: tuple[Row, ...], size: int, name: str) -> F64:

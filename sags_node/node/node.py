@@ -30,6 +30,7 @@ from sags_node.messaging import content
 from sags_node.messaging.cdr import Content
 from sags_node.messaging.masks import MaskSubscriber
 from sags_node.messaging.publisher import Publisher
+from sags_node.messaging.requests import without_args
 from sags_node.messaging.thin import thin_pictures
 from sags_node.messaging.topics import ThinPicture
 from sags_node.node.allowance import Allowance, Pace
@@ -415,11 +416,11 @@ class Node:
 
     def _handlers(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
         return self._operations.handlers() | {
-            "get_status": lambda args: content.status(self.health(), self._last_sent),
-            "get_health": lambda args: content.health_answer(self.health()),
+            "get_status": without_args(lambda: content.status(self.health(), self._last_sent)),
+            "get_health": without_args(lambda: content.health_answer(self.health())),
             "start_recording": self._start_recording,
-            "stop_recording": lambda args: self._recorder.stop(),
-            "take_snapshot": lambda args: self._recorder.snapshot(),
+            "stop_recording": without_args(lambda: self._recorder.stop()),
+            "take_snapshot": without_args(lambda: self._recorder.snapshot()),
         }
 
     def _start_recording(self, args: dict[str, Any]) -> Future[Any]:

@@ -21,9 +21,11 @@ from sags_node.messaging.requests import (
     AnchorName,
     AnchorRequest,
     MeasureRequest,
+    SaveRequest,
     ViewName,
     ViewRequest,
     parse,
+    without_args,
 )
 from sags_node.model.ply import write_ply
 from sags_node.node.health import Statistics
@@ -66,16 +68,16 @@ class Operations:
     def handlers(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
         """The handlers by operation name; one returns a `Future` where another thread does the work."""
         return {
-            "get_parameters": lambda args: self._state.config.model_dump(mode="json"),
+            "get_parameters": without_args(lambda: self._state.config.model_dump(mode="json")),
             "set_parameters": lambda args: self.for_mapping.post(lambda: self._set_parameters(args)),
-            "reset_model": lambda args: self.for_mapping.post(self._reset_model),
-            "pause": lambda args: self.for_mapping.post(self._pause),
-            "resume": lambda args: self.for_mapping.post(self._resume),
+            "reset_model": without_args(lambda: self.for_mapping.post(self._reset_model)),
+            "pause": without_args(lambda: self.for_mapping.post(self._pause)),
+            "resume": without_args(lambda: self.for_mapping.post(self._resume)),
             "add_anchor": lambda args: self.for_mapping.post(lambda: self._add_anchor(args)),
             "remove_anchor": lambda args: self.for_mapping.post(lambda: self._remove_anchor(args)),
             "measure": lambda args: self.for_mapping.post(lambda: self._measure(args)),
-            "start_strain": lambda args: self.for_mapping.post(self._start_strain),
-            "stop_strain": lambda args: self.for_mapping.post(self._state.pipeline.stop_strain),
+            "start_strain": without_args(lambda: self.for_mapping.post(self._start_strain)),
+            "stop_strain": without_args(lambda: self.for_mapping.post(self._state.pipeline.stop_strain)),
             "open_view": lambda args: self.for_drawing.post(lambda: self._open_view(args)),
             "close_view": lambda args: self.for_drawing.post(lambda: self._close_view(args)),
             "save_model": self._save_model,
@@ -183,8 +185,8 @@ class Operations:
         return {}
 
     def _save_model(self, args: dict[str, Any]) -> Future[Any]:
-        path = args.get("path")
-        if not isinstance(path, str) or not path.endswith(".ply"):
+        path = parse(SaveRequest, args).path
+        if not path.endswith(".ply"):
             raise SagsError("save_model needs a path that ends in .ply")
         if "\0" in path:
             raise SagsError("a path cannot hold a zero character")

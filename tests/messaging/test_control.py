@@ -58,6 +58,11 @@ def test_results_and_errors_come_back(tmp_path: Path) -> None:
             with pytest.raises(UsageError, match="ping: what is asked cannot be sent"):
                 asker.request("ping", {"x": unsendable})
         assert client.request(endpoint, "ping", {}) == {"v": "1.0", "id": 7, "ok": True, "result": "pong"}
+        for op in ("ping", "get_clock"):  # they have no arguments
+            assert "unknown field `x`" in client.request(endpoint, op, {"x": 1})["error"]
+        with client.zmq_socket(zmq.REQ, endpoint) as plain:
+            plain.send(msgpack.packb({"v": "1.0", "id": 1, "op": "ping", "within_s": float("nan")}))
+            assert plain.poll(GUARD_MS) and "`$.within_s`" in msgpack.unpackb(plain.recv())["error"]
         reply = client.request(endpoint, "refuse", {})
         assert reply["ok"] is False and "cannot be changed" in reply["error"]
 

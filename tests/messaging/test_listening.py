@@ -126,6 +126,15 @@ def test_one_name_one_node(tmp_path: Path) -> None:
         pass
 
 
+@pytest.mark.parametrize("ns", ["", "../sags", "a b", "a\nb", "a//b"])
+def test_no_sender_has_a_name_that_no_topic_may_have(ns: str, tmp_path: Path) -> None:
+    """Neither a node nor an overlay or a player, whose names no launch file has checked."""
+    config = PublishConfig(data=("tcp://127.0.0.1:*",), control=None, run_dir=tmp_path / "run")
+    with pytest.raises(UsageError, match="is no namespace"), Publisher(config, ns, "session"):
+        pass
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.fault("process: it may open fewer files than its clients need")
 def test_a_low_limit_of_files_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     before = resource.getrlimit(resource.RLIMIT_NOFILE)

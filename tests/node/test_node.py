@@ -155,8 +155,12 @@ def test_control_socket_reads_changes_and_saves(control: ControlClient, tmp_path
         ("save_model", {"path": "a\0b.ply"}, "zero character"),
         ("make_coffee", {}, "unknown"),
     ):
-        with pytest.raises(SagsError, match=why):
+        with pytest.raises(SagsError, match=why) as refused:
             control.request(op, args)
+    for op in str(refused.value).rpartition("knows: ")[2].split(", "):
+        with pytest.raises(SagsError, match="sugar"):  # no operation takes what would have no effect
+            control.request(op, {"sugar": 2})
+    assert control.request("get_status")["state"] == "running"
     for budget_ms in (50, None):
         assert control.request("get_parameters")["mapping"]["budget_ms"] != budget_ms
         said = control.request("set_parameters", {"mapping.budget_ms": budget_ms})
