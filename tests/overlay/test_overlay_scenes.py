@@ -183,6 +183,10 @@ def test_a_mesh_without_an_end_mark_that_may_have_broken_off_is_warned_of(
         ("objects: [{shape: target, opacity: 0}]", "greater than 0"),
         ("objects: [{shape: target, deform: true}]", "deform: true needs a file, and three anchors"),
         ("objects: [{shape: target, deform_depth_mm: 9}]", "deform_depth_mm says how deep `deform: true`"),
+        ("objects: [{shape: sphere, scale: 2}]", "scale is of a file, which this object has not"),
+        ("objects: [{label: a, point_size: 0.005}]", "point_size is of a file, which this object has not"),
+        ("objects: [{shape: target, at_units: file}]", "at_units is of a file, which this object has not"),
+        ("objects: [{file: a.ply, coordinates: world, anchors: [{pixel: [1, 2]}]}]", "coordinates is for"),
         ("objects: [{shape: target, registration: {share: 2}}]", "objects.0.registration.share: "),
         ("objects: [{shape: target, registration: {residual_p90_mm: -1}}]", "registration.residual_p90_mm: "),
         ("objects: [{shape: target, margin: 5}]", "objects.0.margin: a margin is in metres"),
@@ -206,6 +210,8 @@ def test_other_mistakes_are_named(tmp_path: Path) -> None:
     refused(2, "overlay", "--scene", scene, said=("scene.yaml", "check the path"))
     scene.write_text("objects: [{shape: target}]")
     refused(2, "overlay", "--scene", scene, "--pin", "3", "4", said=("--pin is for the built-in target",))
+    for pin in (("nan", "4"), ("3", "inf")):
+        refused(2, "overlay", "--pin", *pin, said=("built-in scene", "should be a finite number"))
     refused(2, "overlay", "--scene", scene, "--endpoint", "tcp://127.0.0.1:9", said=("--control",))
 
 

@@ -157,9 +157,14 @@ def test_register_hold_pull_occlude_come_near_measure_and_freeze(tmp_path: Path)
 
         # Register: the model comes to lie where it is.
         film.play(rest)
+        # The scene names the file as it is found from there, also where a link leads to its folder.
         files = written(Organ(), tmp_path)
-        scene, given = files / "scene.yaml", ("--points", files / "pairs.yaml", "--run-dir", run_dir)
-        command = ("register", files / "organ.ply", *given, "-o", scene, "--force", "--json")
+        model = (files / "organ.ply").rename(files / f"{'organ' * 20}.ply")  # longer than a label may be
+        (tmp_path / "deep/scenes").mkdir(parents=True)
+        (tmp_path / "linked").symlink_to("deep/scenes")
+        scene = tmp_path / "linked/scene.yaml"
+        command = ("register", model, "--points", files / "pairs.yaml", "--run-dir", run_dir)
+        command += ("-o", scene, "--force", "--json")
 
         def registered() -> Any:
             """After a gap on a busy machine too little is sure to begin with."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from sags_node.clients.overlay.mesh_files import STL_START, STL_TRIANGLE, parse_mesh, stl_triangles
 from sags_node.clients.overlay.pose import on_surface
-from sags_node.clients.overlay.scene import ObjectSpec
+from sags_node.clients.overlay.scene import ObjectSpec, checked
 from sags_node.errors import UsageError
 from sags_node.files import read_file
 from sags_node.geometry import transform
@@ -59,7 +59,7 @@ def surface_of(file: Path, scale: float) -> Mesh:
     """
     if file.suffix.lower() not in _MESHES:
         raise UsageError(f"{file} is no surface: the name must end in one of {' '.join(_MESHES)}")
-    return _load(ObjectSpec(file=file, scale=scale), file, points_too=False)
+    return _load(checked(ObjectSpec, {"file": file, "scale": scale}, file), file, points_too=False)
 
 
 # ---- files -----------------------------------------------------------------------------------------------

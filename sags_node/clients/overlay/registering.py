@@ -10,7 +10,7 @@ import numpy as np
 
 from sags_node.clients.overlay.frame import CONFIDENCE, NEEDED, TissueFrame, tissue_frame
 from sags_node.clients.overlay.mesh import surface_of
-from sags_node.clients.overlay.scene import PairSpec, PairsSpec
+from sags_node.clients.overlay.scene import LONGEST_LABEL, PairSpec, PairsSpec
 from sags_node.clients.registration.register import register
 from sags_node.clients.registration.surfaces import Shape, Surface
 from sags_node.confidence import SURE
@@ -65,8 +65,9 @@ def register_live(
     anchors = [
         {"place": _short(place), "at": _short(point)} for place, point in zip(held, local, strict=True)
     ]
-    file = os.path.relpath(model, scene.parent)
-    thing = {"file": file, "scale": scale, "at_units": "file", "label": model.stem}
+    # `..` of a linked folder is where the link leads to.
+    file = os.path.relpath(model.parent.resolve() / model.name, scene.parent.resolve())
+    thing = {"file": file, "scale": scale, "at_units": "file", "label": model.stem[:LONGEST_LABEL]}
     return said, {"objects": [thing | {"anchors": anchors, "registration": said}]}
 
 

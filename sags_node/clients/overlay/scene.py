@@ -20,6 +20,7 @@ from sags_node.errors import UsageError
 
 ALARM: tuple[int, int, int] = (255, 70, 40)  # RGB, of a zone that a tip is too near to
 WIDEST_MARGIN = 0.05  # m
+LONGEST_LABEL = 64  # characters
 KEY_DISTANCE = 64  # of 255: an object's colour nearer than this to the key colour could be taken for it
 
 Place = tuple[float, float, float]  # m
@@ -83,7 +84,7 @@ class ObjectSpec(Section):
 
     file: Path | None = Field(None, description="mesh (.ply .obj .stl) or points (.ply .pcd .xyz)")
     shape: Shape | None = None
-    label: Annotated[str, Field(min_length=1, max_length=64)] | None = None
+    label: Annotated[str, Field(min_length=1, max_length=LONGEST_LABEL)] | None = None
     color: Color = (255, 210, 40)
     opacity: float = Field(0.85, gt=0, le=1)
     scale: float = Field(1.0, gt=0, le=1000, description="metres per unit of the file")
@@ -113,6 +114,9 @@ class ObjectSpec(Section):
             raise ValueError("an object needs a file, a shape or a label")
         if self.file is not None and self.shape is not None:
             raise ValueError("an object has a file or a shape, not both")
+        of_files = {"scale", "point_size"} | ({"at_units"} if self.at_units == "file" else set())
+        if self.file is None and (named := sorted(of_files & self.model_fields_set)):
+            raise ValueError(f"{named[0]} is of a file, which this object has not: leave it out")
         if len(self.anchors) == 2:
             raise ValueError("two anchors leave it free to turn: give one, or three and more")
         if self.deform and (len(self.anchors) < 3 or (self.file is None and self.shape is None)):
@@ -124,6 +128,8 @@ class ObjectSpec(Section):
         said = [anchor.at is not None for anchor in self.anchors]
         if len(said) > 1 and any(said) and not all(said):
             raise ValueError("either every anchor says `at`, or none does")
+        if "coordinates" in self.model_fields_set and (len(said) < 3 or any(said)):
+            raise ValueError("coordinates is for three anchors or more of which none says `at`: leave it out")
         return self
 
     @property
@@ -183,12 +189,12 @@ def built_in(pixel: tuple[float, float] | None, shape: str) -> SceneSpec:
     """Return a scene of one shape at a pixel, or in the middle of the tissue.
 
     Raises:
-        UsageError: there is no such shape.
+        UsageError: there is no such shape, or the pixel is not finite.
     """
     if shape not in SHAPES:
         raise UsageError(f"unknown shape '{shape}'; shapes: {', '.join(SHAPES)}")
     anchors = [] if pixel is None else [{"pixel": pixel}]
-    return SceneSpec.model_validate({"objects": [{"shape": shape, "anchors": anchors}]})
+    return checked(SceneSpec, {"objects": [{"shape": shape, "anchors": anchors}]}, "built-in scene")
 
 
 def read_scene(file: Path) -> SceneSpec:
@@ -215,7 +221,19 @@ def read_pairs(file: Path) -> PairsSpec:
 
 
 def _read(root: type[S], file: Path, what: str) -> S:
+    return checked(root, read_yaml(file, what), file)
+
+
+def checked(root: type[S], tree: object, where: object) -> S:
+    """Return the section that these values make.
+
+    Args:
+        where: where they stand, for the message.
+
+    Raises:
+        UsageError: an unknown key or a wrong value.
+    """
     try:
-        return root.model_validate(read_yaml(file, what))
+        return root.model_validate(tree)
     except ValidationError as error:
-        raise UsageError(explain(error, file, root=root, page="")) from None
+        raise UsageError(explain(error, where, root=root, page="")) from None
