@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ from sags_node.cli.launching import as_json, group_of, part_of
 from sags_node.cli.node_options import asked_options, endpoint_option
 from sags_node.errors import SagsError, UsageError
 from sags_node.terminal import text
-from sags_node.terminal.console import show
+from sags_node.terminal.console import json_text, show
 
 if TYPE_CHECKING:
     from sags_node.messaging.address import NodeAddress
@@ -153,11 +154,11 @@ def load(file: Path, json_out: bool, node: NodeAddress) -> None:
     if not isinstance(wanted, dict):
         raise UsageError(f"{file} has no parameters: write key: value, as sags param dump does")
     now = dict(leaves(ask(node, "get_parameters")))
-    said = {key: value for key, value in leaves(wanted) if key not in now or now[key] != value}
+    asked = _once(leaves(wanted))
+    said = {key: value for key, value in asked.items() if key not in now or now[key] != value}
     if said:
         ask(node, "set_parameters", said)
-    changed = ", ".join(f"{key} is {value}" for key, value in said.items())
-    show(said if json_out else changed or "all of it is so already")
+    show(said if json_out else _said(said) or "all of it is so already")
 
 
 @param.command("set")
@@ -179,9 +180,23 @@ def set_parameters(overrides: tuple[str, ...], json_out: bool, node: NodeAddress
         if ":=" not in word:
             raise UsageError(f"'{word}' is not an override; write key:=value, e.g. mapping.budget_ms:=25")
     pairs = (word.split(":=", 1) for word in overrides)
-    said = {key: parse_word(value, f"the value of {key}:=") for key, value in pairs}
+    said = _once((key, parse_word(value, f"the value of {key}:=")) for key, value in pairs)
     ask(node, "set_parameters", said)
-    show(said if json_out else ", ".join(word.replace(":=", " is ", 1) for word in overrides))
+    show(said if json_out else _said(said))
+
+
+def _once(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """The values by key; no key may be given twice, as only one value can be in force."""
+    values: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in values:
+            raise UsageError(f"{key} is given twice; keep one")
+        values[key] = value
+    return values
+
+
+def _said(values: Mapping[str, Any]) -> str:
+    return ", ".join(f"{key} is {json_text(value)}" for key, value in values.items())
 
 
 # ---- pause, resume, reset --------------------------------------------------------------------------------

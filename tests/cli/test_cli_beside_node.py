@@ -224,7 +224,7 @@ def test_the_example_follows_a_point_and_removes_it(beside_node: None) -> None:
         pass
 
 
-def test_parameters_are_read_and_set(beside_node: None) -> None:
+def test_parameters_are_read_and_set(beside_node: None, tmp_path: Path) -> None:
     assert figures_of("param", "get", "mapping.budget_ms", "--json") == {"mapping.budget_ms": None}
     assert figures_of("param", "get", "--json")["source"]["kind"] == "folders"
     assert "max_gaussians:" in sags("param", "get", "mapping").stdout
@@ -235,6 +235,11 @@ def test_parameters_are_read_and_set(beside_node: None) -> None:
     assert sags("param", "set", "mapping.budget_ms:=null").exit_code == 0
     refused(2, "param", "get", "mapping.budget", said=("unknown key 'mapping.budget'", "budget_ms"))
     refused(2, "param", "set", "mapping.budget_ms", "20", said=("write mapping.budget_ms:=20",))
+    twice = ("mapping.budget_ms is given twice",)
+    refused(2, "param", "set", "mapping.budget_ms:=20", "mapping.budget_ms:=30", said=twice)
+    (tmp_path / "mine.yaml").write_text("mapping.budget_ms: 20\nmapping: {budget_ms: 30}\n")
+    refused(2, "param", "load", tmp_path / "mine.yaml", said=twice)
+    assert sags("param", "set", "mapping.budget_ms:=").stdout == "mapping.budget_ms is null\n"
     refused(1, "param", "set", "mapping.rung:=2", said=("mapping.rung", "cannot be changed", "budget_ms"))
 
 
