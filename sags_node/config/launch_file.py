@@ -279,7 +279,10 @@ def explain(
         page: that describes its keys; "": none does.
     """
     lines = []
-    mistakes = error.errors()
+    found = error.errors()
+    around = {item["loc"][:depth] for item in found for depth in range(len(item["loc"]))}
+    # pydantic calls a list too short whose only item is wrong.
+    mistakes = [item for item in found if item["type"] != "too_short" or item["loc"] not in around]
     for item in mistakes[:MOST_MISTAKES]:
         path = [str(part) for part in item["loc"]]
         where = ".".join(part for part in path if part not in _SOURCES)

@@ -419,8 +419,9 @@ class Node:
             "get_status": without_args(lambda: content.status(self.health(), self._last_sent)),
             "get_health": without_args(lambda: content.health_answer(self.health())),
             "start_recording": self._start_recording,
-            "stop_recording": without_args(lambda: self._recorder.stop()),
-            "take_snapshot": without_args(lambda: self._recorder.snapshot()),
+            # The recorder needs the publisher, which gets these, and is made after it.
+            "stop_recording": without_args(lambda: self._recorder.stop()),  # noqa: PLW0108
+            "take_snapshot": without_args(lambda: self._recorder.snapshot()),  # noqa: PLW0108
         }
 
     def _start_recording(self, args: dict[str, Any]) -> Future[Any]:

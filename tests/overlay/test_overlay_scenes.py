@@ -10,7 +10,8 @@ from command_line import refused
 
 from sags_node.clients.overlay.mesh import LEAN, mesh_of
 from sags_node.clients.overlay.mesh_files import triangulate
-from sags_node.clients.overlay.scene import ObjectSpec, built_in
+from sags_node.clients.overlay.scene import ObjectSpec, built_in, read_scene
+from sags_node.errors import UsageError
 from sags_node.types import F64
 
 
@@ -203,6 +204,9 @@ def test_a_mesh_without_an_end_mark_that_may_have_broken_off_is_warned_of(
 def test_a_wrong_scene_is_one_clear_message(text: str, said: str, tmp_path: Path) -> None:
     (tmp_path / "scene.yaml").write_text(text)
     refused(2, "overlay", "--scene", tmp_path / "scene.yaml", said=("scene.yaml", said))
+    with pytest.raises(UsageError) as caught:
+        read_scene(tmp_path / "scene.yaml")
+    assert ("at least 1 item" in str(caught.value)) == (text == "objects: []")  # a wrong object is there
 
 
 def test_other_mistakes_are_named(tmp_path: Path) -> None:
