@@ -14,7 +14,6 @@ import numpy as np
 from sags_node.engine.rasterizer.rasterize import Drawer
 from sags_node.errors import SagsError, UsageError
 from sags_node.kernels.threads import configure_threads
-from sags_node.mapping.devices import backend_of
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.content import SLOPE_FIELDS, SPLAT_FIELDS, gaussians_of
 from sags_node.messaging.received import ReceivedCameraInfo, ReceivedCloud, ReceivedRos, TopicName
@@ -140,13 +139,13 @@ def scenes_of_session(session: Session) -> Iterator[Scene]:
     """
     configure_threads(session.config.engine.threads)
     pipeline = Pipeline(session.config, session.rig)
-    budget, backend = pipeline.make_budget(), backend_of(session.config)
+    budget = pipeline.make_budget()
     with session.source as source:
         for frame in source:
             result = pipeline.process(frame, budget)
             if not frame.warm_up:
                 shown, held = result.snapshot, result.held
-                yield Scene(shown.gaussians, shown.camera, frame.t_capture_ns, held, backend=backend)
+                yield Scene(shown.gaussians, shown.camera, frame.t_capture_ns, held, backend=session.backend)
 
 
 # ---- a fit -----------------------------------------------------------------------------------------------
@@ -181,7 +180,7 @@ def scenes_of_fit(folder: Path, session: Session, advance: Advance) -> Iterator[
 
 
 def _scene_of(fit: Fit, frame: ClipFrame, session: Session) -> Scene:
-    drawn = fit.settings.antialias, backend_of(session.config)
+    drawn = fit.settings.antialias, session.backend
     return Scene(fit.gaussians(frame), frame.camera, frame.t_capture_ns, "", *drawn)
 
 
