@@ -22,6 +22,7 @@ pytest.importorskip("pyigtl", reason="no OpenIGTLink without: pip install '.[bri
 
 from pyigtl.messages import PointMessage
 
+from sags_node.cli.bridge import openigtlink
 from sags_node.clients.bridge import igtl, igtl_peers
 from sags_node.clients.bridge.igtl import MAX_BODY_BYTES
 from sags_node.clients.bridge.igtl_peers import MOST_PEERS, Peers
@@ -373,5 +374,7 @@ def test_a_taken_port_and_an_unknown_output_are_said(tmp_path: Path) -> None:
         port = taken.getsockname()[1]
         with pytest.raises(SagsError, match=f"port {port}.*choose another --port"):
             run_openigtlink(options(tmp_path, port=port), lambda *_: None, threading.Event())
-    with pytest.raises(UsageError, match="--send depth: there is picture"):
+    with pytest.raises(UsageError, match="--send depth: there is picture") as refused:
         run_openigtlink(options(tmp_path, send=("depth",)), lambda *_: None, threading.Event())
+    offered = str(refused.value).split("there is ")[1].replace(", ", ",")
+    assert any(f"Some of {offered};" in (option.help or "") for option in openigtlink.params)  # --help
