@@ -15,7 +15,7 @@ from sags_node.detail.memory import Matched, Memory
 from sags_node.detail.motion import SmallDrawings
 from sags_node.detail.seen import SeenFrame
 from sags_node.detail.show import ASIDE_EVERY, LESSON_EVERY, Detail, Lessons
-from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer, to_view
+from sags_node.engine.rasterizer.rasterize import Drawer, to_view
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import UsageError
 from sags_node.geometry import transform
@@ -173,9 +173,9 @@ class Measurer:
         self._aside = aside
 
     @cached_property
-    def _rasterizer(self) -> Rasterizer:
+    def _drawer(self) -> Drawer:
         camera = self._rectifier.camera
-        return make_rasterizer(backend_of(self._config), camera.width, camera.height)
+        return Drawer(backend_of(self._config), camera.width, camera.height)
 
     @cached_property
     def _tissue_of(self) -> TissueMask:
@@ -320,7 +320,7 @@ class Measurer:
         Args:
             gaussians: of the frame, moved `ahead` frames.
         """
-        planes = self._rasterizer.forward(gaussians, camera)
+        planes = self._drawer.forward(gaussians, camera)
         model = colours_of(planes)
         if self._detail is None:
             return model, model
@@ -331,7 +331,7 @@ class Measurer:
     def _held_out(self, now: _Recorded, before: _Mapped) -> FrameRow:
         camera, truth = self._camera_of_run(now.pair.camera, before), now.truth
         expected = extrapolated(before.shown.snapshot, now.seconds - before.recorded.seconds)
-        guess = colours_of(self._rasterizer.forward(expected, camera))
+        guess = colours_of(self._drawer.forward(expected, camera))
         tissue = self._tissue_of(now.frame, now.pair)
         found = self._quality(guess, now, tissue, costly=True)
         found["copy_psnr"] = metrics.psnr(before.recorded.truth, truth, tissue)
@@ -347,7 +347,7 @@ class Measurer:
         )
         share = (held.row.seconds - start) / (end - start)
         middle = between(before.lent, after.lent.gaussians, share)
-        planes = self._rasterizer.forward(middle, held.camera)
+        planes = self._drawer.forward(middle, held.camera)
         around = (before.lent, 1 - share), (after.lent, share)
         pictures = {
             "psnr": colours_of(planes),
@@ -379,7 +379,7 @@ class Measurer:
             exclude = self._config.vision.tissue.exclude  # boxes of the raw images, burnt into both eyes
             self._usable_right = right_pixels(self._rectifier, now.frame, exclude)
         before = self._earlier[0].recorded.pair.right if self._earlier else None
-        figures = right_figures(shown, now.pair, self._usable_right, self._rasterizer, before)
+        figures = right_figures(shown, now.pair, self._usable_right, self._drawer, before)
         return figures if shown.right_rgb is not None else {"novel": figures["novel"]}
 
     def _follow(self, shown: MappedFrame, reference: Reference, given: Camera) -> TrackErrors | None:
