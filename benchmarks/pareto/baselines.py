@@ -45,7 +45,7 @@ def measured_baselines(
     config = session.config
     rectifier = Rectifier(session.rig, *size)
     usable: Bool | None = None
-    rasterizer = Drawer("numba", *size)
+    drawer = Drawer("numba", *size)
     matchers = [
         JudgedSGBM(config.vision.stereo, rectifier.camera, rectifier.baseline, scale) for scale in SGBM_SCALES
     ]
@@ -64,7 +64,7 @@ def measured_baselines(
             if next(places) % options.every == 0:
                 if usable is None:
                     usable = right_pixels(rectifier, frame, config.vision.tissue.exclude)
-                right = right_figures(shown, pair, usable, rasterizer).get("right", NO_RIGHT)
+                right = right_figures(shown, pair, usable, drawer).get("right", NO_RIGHT)
                 warped.append(FrameRow(frame.frame_id, 0.0, {"novel": {"psnr": right["warp_psnr"]}}))
                 drawn.append(FrameRow(frame.frame_id, 0.0, {"novel": {"psnr": right["model_psnr"]}}))
                 covered.append(right["coverage"])
