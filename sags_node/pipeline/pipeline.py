@@ -324,6 +324,7 @@ class Pipeline:
             pair, observation, mapped.snapshot, views, self._epoch(frame), clock.timings_ms,
             self._skipped(measured), anchors, plan.state, hurried=measured.hurried,
             instruments=instruments, strain=self._strain,
+            plain=len(self.seen) > 0 and views["left"].shown is None,
         )  # fmt: skip
         return replace(self.newest, held=judged.hold) if judged.hold else self.newest
 
@@ -339,7 +340,7 @@ class Pipeline:
             self._forget()
         last = self.newest
         lacks = last is not None and (  # somebody has just asked for it
-            (left and len(self.seen) > 0 and last.views["left"].shown is None)
+            (left and last.plain)
             or (right and "right" not in last.views)
             or (instruments and not self._instruments_asked)
         )
