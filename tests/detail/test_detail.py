@@ -27,14 +27,14 @@ from sags_node.messaging import published
 from sags_node.messaging.content import tells_of
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.requests import ViewRequest
+from sags_node.node import node as node_module
 from sags_node.node.allowance import Allowance
-from sags_node.node.node import LOOKS_AGAIN
 from sags_node.node.views import Views
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.quality import metrics
 from sags_node.tools.evaluation.measure import MeasureOptions
 from sags_node.tools.evaluation.session import evaluate
-from sags_node.types import F32, U8, Camera, Gaussians, Shown
+from sags_node.types import F32, U8, Camera, FrameResult, Gaussians, RenderedView, Shown
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 CAMERA = camera_in_front(WIDTH, HEIGHT, FOCAL)
@@ -377,9 +377,26 @@ def test_who_takes_single_images_gets_their_detail_after_any_silence(
     node = RunningNode(phantom_session, tmp_path, "source.pace:=fast")
     with ControlClient(node.connection["control"]) as control:
         until(lambda: control.request("get_status")["gaussians"], START_SECONDS)
-        for silence in (0.5, LOOKS_AGAIN + 0.5):
+        for silence in (0.5, node_module.LOOKS_AGAIN + 0.5):
             for name in (RENDER, THIN):
                 time.sleep(silence)
                 (first,) = client.collect(node.data, [name], 1, START_SECONDS)[name]
                 assert "detail_age_ns" in first.meta, (name, silence)
     assert node.stop() == 0, node.said()
+
+
+@pytest.mark.live
+def test_a_recordings_first_frames_have_detail_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who starts a node looks soon; of a short recording nothing would be left for them."""
+    monkeypatch.setattr(node_module, "LOOKS_AGAIN", 60.0)  # however slow this machine is
+    own = ["publish.data:=[]", "publish.control:=null", f"publish.run_dir:={tmp_path / 'run'}"]
+    session = opened("source.frames:=3", "mapping.max_gaussians:=3000", *own)
+    views: list[RenderedView] = []
+
+    def note(result: FrameResult, _: float) -> None:
+        views.append(result.views["left"])
+
+    node = node_module.Node(session.config, session.rig, session.source, note)
+    node.start()
+    assert node.wait(START_SECONDS)
+    assert len(views) == 3 and all(view.shown is not None for view in views)
