@@ -322,9 +322,8 @@ class Pipeline:
         self._mapped_ns = pair.t_capture_ns
         self.newest = FrameResult(
             pair, observation, mapped.snapshot, views, self._epoch(frame), clock.timings_ms,
-            self._skipped(measured), anchors, plan.state, hurried=measured.hurried,
-            instruments=instruments, strain=self._strain,
-            plain=len(self.seen) > 0 and views["left"].shown is None,
+            self._skipped(measured), anchors, plan.state, hurried=measured.hurried, strain=self._strain,
+            instruments=instruments, plain=len(self.seen) > 0 and views["left"].shown is None,
         )  # fmt: skip
         return replace(self.newest, held=judged.hold) if judged.hold else self.newest
 
