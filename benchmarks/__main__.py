@@ -8,7 +8,7 @@ from sags_node.cli.main import begin, sags_group
 def main(verbose: bool, form: str) -> None:
     """Measure run time and error, on this machine.
 
-    Kept figures are in benchmarks/results; benchmarks/README.md has the command that made each.
+    Kept figures are in benchmarks/results; `provenance` in each file has the command that made it.
     """
     begin(verbose, form)
 

@@ -468,6 +468,7 @@ class FrameResult:
     recorded_s: float | None = None  # as `StereoFrame.recorded_s`
     instruments: InstrumentStates | None = None  # None: nobody asked
     strain: Strained | None = None  # None: nobody asked
+    plain: bool = False  # as nobody looked, its left view lacks the detail of images
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.quality.sgbm import JudgedSGBM
-from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.engine.rasterizer.rasterize import Drawer
 from sags_node.pipeline.session import Session
 from sags_node.quality import metrics
 from sags_node.sources.source import open_source
@@ -45,7 +45,7 @@ def measured_baselines(
     config = session.config
     rectifier = Rectifier(session.rig, *size)
     usable: Bool | None = None
-    rasterizer = make_rasterizer("numba", *size)
+    drawer = Drawer("numba", *size)
     matchers = [
         JudgedSGBM(config.vision.stereo, rectifier.camera, rectifier.baseline, scale) for scale in SGBM_SCALES
     ]
@@ -64,7 +64,7 @@ def measured_baselines(
             if next(places) % options.every == 0:
                 if usable is None:
                     usable = right_pixels(rectifier, frame, config.vision.tissue.exclude)
-                right = right_figures(shown, pair, usable, rasterizer).get("right", NO_RIGHT)
+                right = right_figures(shown, pair, usable, drawer).get("right", NO_RIGHT)
                 warped.append(FrameRow(frame.frame_id, 0.0, {"novel": {"psnr": right["warp_psnr"]}}))
                 drawn.append(FrameRow(frame.frame_id, 0.0, {"novel": {"psnr": right["model_psnr"]}}))
                 covered.append(right["coverage"])

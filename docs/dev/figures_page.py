@@ -174,18 +174,20 @@ def _claims() -> str:
     rows = [
         f"{filled(line)} | {', '.join(f'`{name}`' for name in claimed(line))}" for line in lines("claims.txt")
     ]
-    origins = f"{_origin('revision')} {_origin('machine')}"
-    return f"{table(' | this | compared with | run | `results/`', rows)}\n{origins}\n"
+    return f"{table(' | this | compared with | run | `results/`', rows)}\n{_origins()}\n"
 
 
-def _origin(key: str) -> str:
-    """What most results are of by this key of their provenance, and those of another one by name."""
+def _origins() -> str:
+    """Of how many revisions results are, and those that are not of the usual machine by name."""
+    origins = {file.stem: result(file.stem)["provenance"] for file in sorted(RESULTS.glob("*.json"))}
     found: dict[str, list[str]] = {}
-    for file in sorted(RESULTS.glob("*.json")):
-        found.setdefault(result(file.stem)["provenance"][key], []).append(f"`{file.stem}`")
-    most, *others = sorted(found, key=lambda value: -len(found[value]))
-    apart = "".join(f" Of `{value}`: {', '.join(found[value])}." for value in others)
-    return f"{len(found[most])} of {sum(map(len, found.values()))} files are of {key} `{most}`.{apart}"
+    for name, origin in origins.items():
+        found.setdefault(origin["machine"], []).append(f"`{name}`")
+    most, *others = sorted(found, key=lambda machine: -len(found[machine]))
+    apart = "".join(f" On `{machine}`: {', '.join(found[machine])}." for machine in others)
+    revisions = len({origin["revision"] for origin in origins.values()})
+    usual = f"{len(found[most])} of them from `{most}`."
+    return f"The {len(origins)} files are of {revisions} revisions, {usual}{apart}"
 
 
 def _live() -> str:

@@ -139,7 +139,7 @@ def _check_installed(module: str, package: str, command: str) -> None:
     "--send",
     metavar="NAMES",
     default="",
-    help="Some of image,render,overlay,surface,anchors,camera; default: all.",
+    help="Some of picture,render,overlay,surface,anchors,camera; default: all.",
 )
 @shown("--rate", type=positive, default=10.0, help="Hz of all but the surface.")
 @shown("--surface-rate", type=positive, default=2.0, help="Hz of the surface.")

@@ -3,7 +3,7 @@
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from sags_node.tools.fitting.clip import read_clip
 from sags_node.tools.fitting.fit import FITTING, Fit
 from sags_node.tools.fitting.outlook import Outlook
 from sags_node.tools.fitting.score import published, score, score_between, score_depth, score_tracks
-from sags_node.tools.fitting.settings import LEAST, FitSettings, Schedule
+from sags_node.tools.fitting.settings import LEAST, FitSettings, Schedule, iterations_for
 from sags_node.tools.fitting.start import FOLLOW, LEARN, PATH_STEPS
 from sags_node.types import Bool, StereoFrame
 
@@ -90,6 +90,7 @@ def fit_session(
     resume: bool,
     advance: Advance,
     device: str | None = None,
+    by_length: bool = False,
 ) -> dict[str, Any]:
     """Fit a recording and leave `checkpoint.npz`, `model.ply`, `test/` and `figures.json` in `out`.
 
@@ -101,6 +102,7 @@ def fit_session(
         resume: go on from its checkpoint.
         advance: called with what is going on.
         device: as `device_of` returns it.
+        by_length: whether the iterations are those of `iterations_for`.
 
     Returns:
         The figures.
@@ -124,6 +126,8 @@ def fit_session(
     clip = read_clip(
         session, options.holds_out, lambda done: advance(done, count, "reading"), noted, settings.midway
     )
+    if by_length:
+        settings = replace(settings, iterations=iterations_for(len(clip.train)))
     try:
         fit = Fit(clip, settings, device)
         online = {FOLLOW: len(clip.train), LEARN: PATH_STEPS} if settings.schedule == "online" else {}

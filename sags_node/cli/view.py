@@ -32,10 +32,10 @@ def view(port: int, host: str, insecure: bool, json_out: bool, node: NodeAddress
     """Show a running node in a web browser on this machine.
 
     A page with the live model in 3D (drag turns, wheel zooms, right drag moves), the left camera and its
-    image; beside it images of your choice (input, model, depth, error, the right eye, stereo, the
-    overlay), rates and latencies; buttons to freeze a moment, to keep a screenshot or the model as a file,
-    and to pause, reset and record. A click on the tissue pins an anchor, which follows it; a click on an
-    anchor chooses it, and the distance to the one before is told.
+    image; beside it images of your choice (input, what is shown, depth, the right eye, stereo, the overlay),
+    rates and latencies; buttons to freeze a moment, to keep a screenshot or the model as a file, and to
+    pause, reset and record. A click on the tissue pins an anchor, which follows it; a click on an anchor
+    chooses it, and the distance to the one before is told.
 
     Nothing old is shown as new: what stops coming disappears within a second, and the line at the top right
     says why. A page that hears nothing from here for 6 s, as when the link to it is cut, covers itself. The

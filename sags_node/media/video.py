@@ -178,7 +178,7 @@ class Video:
         """Read an image, RGB [H, W, 3]; None past the end. Reading in order is fastest.
 
         Raises:
-            LostPictureError: this one cannot be decoded.
+            LostPictureError: this one cannot be decoded, or only in part.
             SagsError: it is of another size than the first one.
         """
         if number >= self.count:
@@ -196,6 +196,11 @@ class Video:
                 return None
         if self._at > number:
             raise LostPictureError(f"{self.path}: image {number} cannot be decoded; copy the file again")
+        if self._damaged is not None and number >= self._damaged:
+            raise LostPictureError(
+                f"{self.path}: image {self._damaged} is damaged: it and those behind it, up to the next key "
+                "frame, are left out; copy the file again"
+            )
         assert self._frame is not None
         return self._converted(self._frame)
 
@@ -230,6 +235,7 @@ class Video:
         """Decode the first image from the position of the container on."""
         self._frames = self._pictures(is_sought)
         self._at = -1
+        self._damaged: int | None = None  # the first image since a key frame of which a part was made up
         return self._decode()
 
     def _jump(self, number: int) -> None:
@@ -238,7 +244,8 @@ class Video:
             at = int(np.searchsorted(self._keys[:, 0], self._pts[number], "right")) - 1
             with suppress(av.FFmpegError):  # from containers that cannot seek
                 self._container.seek(int(self._keys[max(at, 0), 1]), stream=self._stream)
-                if self._begin(is_sought=True) is not None and self._at <= number:
+                # What begins behind its key frame, if there are none, lacks what was refreshed before.
+                if self._begin(is_sought=True) is not None and self._at <= self._key_of(number):
                     return
         self._restart()
 
@@ -254,13 +261,23 @@ class Video:
         self._frame = None  # its memory is used again
         for frame in self._frames:
             number = self._number_of(frame)
+            if frame.is_corrupt:
+                self._note_damage(number)
+            elif self._damaged is not None and number > self._damaged:
+                # Without key frames images are refreshed bit by bit, from one marked packet to the next.
+                if frame.key_frame or self._key_of(max(0, self._key_of(number) - 1)) > self._damaged:
+                    self._damaged = None
             if number > self._at:
                 self._at, self._frame = number, frame
                 return frame
         return None
 
-    def _number_of(self, frame: av.VideoFrame) -> int:
-        """The number of an image by its stamp; -1: it is not shown."""
+    def _note_damage(self, number: int) -> None:
+        if self._damaged is None and number >= 0:
+            self._damaged = number
+
+    def _number_of(self, frame: av.VideoFrame | av.Packet[av.VideoStream]) -> int:
+        """The number of an image, or of a packet's, by its stamp; -1: it is not shown."""
         if self._pts is None:
             return self._at + 1
         if frame.pts is None:
@@ -281,8 +298,11 @@ class Video:
             begun = begun or packet is None or (packet.pts, packet.size) in self._begins
             if not begun:
                 continue
-            with suppress(av.FFmpegError):
+            try:
                 yield from self._stream.decode(packet)
+            except av.FFmpegError:
+                if packet is not None and (is_sought or self._at >= 0):  # else nothing is built on it
+                    self._note_damage(self._number_of(packet))
             if packet is None:
                 return
 

@@ -254,19 +254,18 @@ OF_THE_MODEL = (
 
 def tells_of(result: FrameResult, topic: str) -> bool:
     """Tell whether a frame has content for a topic. A held frame has none of the model. The depth may not
-    have been measured for lack of time, and the right eye is drawn only while somebody looks at it.
+    have been measured for lack of time. The right eye is drawn only while somebody looks at it, and so is the
+    left eye's detail: who comes gets the next frame, which has it.
     """
-    if result.held and topic in OF_THE_MODEL:
-        return False
-    if topic == "right/render/image" and "right" not in result.views:
-        return False
-    if topic == "instruments" and result.instruments is None:
-        return False
-    if topic.startswith("right/") and result.pair.right is None:
-        return False
-    if topic == "left/render/depth_confidence" and result.views["left"].confidence is None:
-        return False
-    return topic != "left/depth" or not result.hurried
+    lacks = {
+        "left/render/image": result.plain,
+        "right/render/image": "right" not in result.views,
+        "instruments": result.instruments is None,
+        "left/render/depth_confidence": result.views["left"].confidence is None,
+        "left/depth": result.hurried,
+    }
+    of_no_eye = topic.startswith("right/") and result.pair.right is None
+    return not (of_no_eye or lacks.get(topic) or (result.held and topic in OF_THE_MODEL))
 
 
 def health_fields(health: NodeHealth) -> dict[str, Any]:

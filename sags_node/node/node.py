@@ -10,7 +10,6 @@ take no more of a core than `allowance` says.
 """
 
 import logging
-import math
 import os
 import threading
 import time
@@ -121,8 +120,8 @@ class Node:
         # By name, the newest only; None: closed. Single operations on a dict need no lock.
         self._drawn: dict[str, DrawnView | None] = {}
         self._watched: frozenset[str] = frozenset()  # views that somebody subscribes to
-        self._left_is_watched = False  # somebody looks at the left view, or did lately
-        self._left_looked_at = -math.inf  # when somebody did (s, monotonic)
+        self._left_is_watched = True  # somebody looks at the left view, or did lately; will at the start
+        self._left_looked_at = time.monotonic()  # when somebody did (s)
         self._right_is_watched = False  # somebody looks at the right eye
         self._instruments_asked = False
         self._error: BaseException | None = None

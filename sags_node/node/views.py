@@ -14,9 +14,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sags_node.detail.seen import SeenFrame
-from sags_node.engine.interface import Rasterizer
 from sags_node.engine.rasterizer.confidence import with_confidence
-from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
+from sags_node.engine.rasterizer.rasterize import Drawer, to_view
 from sags_node.errors import SagsError
 from sags_node.geometry import scale_intrinsics
 from sags_node.messaging import published
@@ -84,7 +83,7 @@ class Views:
         self._latency = latency
         self._backend = backend
         self._views: dict[str, _View] = {}
-        self._rasterizers: dict[tuple[int, int], Rasterizer] = {}
+        self._drawers: dict[tuple[int, int], Drawer] = {}
         self._watched: Collection[str] = ()
         self._teacher = Teacher() if detail else None
 
@@ -127,9 +126,9 @@ class Views:
         self._note()
 
     def _forget_sizes(self) -> None:
-        """Free the rasterizers of sizes that no view has any more: tens of MB each."""
+        """Free the drawers of sizes that no view has any more: tens of MB each."""
         sizes = {(view.request.width, view.request.height) for view in self._views.values()}
-        self._rasterizers = {size: kept for size, kept in self._rasterizers.items() if size in sizes}
+        self._drawers = {size: kept for size, kept in self._drawers.items() if size in sizes}
 
     def draw_due(
         self, scene: FrameResult, watched: Collection[str], seen: Sequence[SeenFrame] = ()
@@ -198,18 +197,10 @@ class Views:
         return DrawnView(pictures, scene.pair.baseline, request.depth, request.static, scene.epoch, ahead)
 
     def _planes(self, gaussians: Gaussians, camera: Camera) -> F32:
-        """Draw as `Rasterizer.forward` does. After a failure of the GPU, always the CPU draws."""
         size = camera.width, camera.height
-        try:
-            if size not in self._rasterizers:
-                self._rasterizers[size] = make_rasterizer(self._backend, *size)
-            return self._rasterizers[size].forward(gaussians, camera)
-        except RuntimeError:
-            if self._backend == "numba":
-                raise
-            log.exception("the GPU cannot draw views any more; the CPU does")
-            self._backend, self._rasterizers = "numba", {}
-            return self._planes(gaussians, camera)
+        if size not in self._drawers:
+            self._drawers[size] = Drawer(self._backend, *size)
+        return self._drawers[size].forward(gaussians, camera)
 
     # ---- rates -----------------------------------------------------------------------------------------
 

@@ -322,8 +322,8 @@ class Pipeline:
         self._mapped_ns = pair.t_capture_ns
         self.newest = FrameResult(
             pair, observation, mapped.snapshot, views, self._epoch(frame), clock.timings_ms,
-            self._skipped(measured), anchors, plan.state, hurried=measured.hurried,
-            instruments=instruments, strain=self._strain,
+            self._skipped(measured), anchors, plan.state, hurried=measured.hurried, strain=self._strain,
+            instruments=instruments, plain=len(self.seen) > 0 and views["left"].shown is None,
         )  # fmt: skip
         return replace(self.newest, held=judged.hold) if judged.hold else self.newest
 
@@ -339,7 +339,7 @@ class Pipeline:
             self._forget()
         last = self.newest
         lacks = last is not None and (  # somebody has just asked for it
-            (left and len(self.seen) > 0 and last.views["left"].shown is None)
+            (left and last.plain)
             or (right and "right" not in last.views)
             or (instruments and not self._instruments_asked)
         )

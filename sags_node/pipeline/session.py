@@ -17,7 +17,7 @@ from sags_node.config.schema import (
     V4l2Source,
 )
 from sags_node.errors import UsageError
-from sags_node.mapping.devices import with_scale
+from sags_node.mapping.devices import backend_of, with_scale
 from sags_node.rig import load_camera, load_rig
 from sags_node.sources.endonerf import baseline_of
 from sags_node.sources.pictures import say
@@ -47,6 +47,11 @@ class Session:
     def published_size(self) -> tuple[int, int]:
         """Width and height of the images that consumers get, px."""
         return self.config.vision.published_size(self.rig.left.width, self.rig.left.height)
+
+    @property
+    def backend(self) -> str:
+        """What draws, as for `make_rasterizer`."""
+        return backend_of(self.config)
 
 
 def open_session(

@@ -21,6 +21,7 @@ SMALLEST_BASELINE = 1e-4  # m; less can only be a baseline that was not multipli
 OTHER_SIZES = (0.25, 1 / 3, 0.5, 2.0, 3.0, 4.0)  # of the stated size: a calibration may have been made for it
 SAME_CENTRE = 0.12  # relative tolerance of principal point over middle, in which axes and eyes must agree
 LARGEST_RADIUS, RADII = 4.0, 4001  # at distance 1 (76 degrees from the axis), and how many are tried
+STRAIGHT = 0.1  # px by which skewed pixels may shift the first and the last row: no match is more exact
 WIDE = 90  # degrees from corner to corner: beyond it lenses are often calibrated by fisheye models
 EXCHANGE_FILES = (
     "exchange left.yaml and right.yaml (of a bag or ROS 2: source.left_info and source.right_info)"
@@ -101,6 +102,10 @@ def _check_eyes(rig: StereoRig) -> list[Finding]:
             return [Finding("error", what, "calibrate both together: sags calib stereo, then set rig")]
         for key, K in (("camera_matrix", eye.K), ("projection_matrix", eye.P[:, :3])):
             found += check_intrinsics(f"{file}: {key}", K, eye.width, eye.height)
+        if np.abs(eye.P[1:, 3]).max() > 1e-6 + 1e-3 * abs(eye.P[0, 3]):
+            what = f"{file}: projection_matrix[7] and [11] are {eye.P[1, 3]:g} and {eye.P[2, 3]:g}, not 0"
+            fix = "rows cannot agree: rectify eyes that stand beside each other"
+            found.append(Finding("error", what, fix))
         found += _check_distortion(file, eye) + _check_model(file, eye)
     return found or [Finding("ok", "rotations, focal lengths and principal points are plausible")]
 
@@ -110,7 +115,14 @@ def check_intrinsics(where: str, K: F64, width: int, height: int) -> list[Findin
     if np.any(K[2, :2] != 0):
         what = f"{where} is transposed: its last row is {K[2, 0]:g} {K[2, 1]:g} {K[2, 2]:g}, not 0 0 1"
         return [Finding("error", what, "write its columns as rows (MATLAB's cameraParameters are so)")]
+    if K[1, 0] != 0 or abs(K[2, 2] - 1) > 1e-6:
+        what = f"{where}: its second row begins with {K[1, 0]:g}, its last one is 0 0 {K[2, 2]:g}, not 0 0 1"
+        fix = "for images of another size scale fx, fy, cx and cy alone; or calibrate again"
+        return [Finding("error", what, fix)]
     found = []
+    if (shift := abs(K[0, 1] / K[1, 1]) * height / 2 if K[1, 1] else 0.0) > STRAIGHT:
+        what = f"{where}: its skew of {K[0, 1]:g} px shifts the first row by {shift:.2g} px"
+        found.append(Finding("error", what, "calibrate without skew (MATLAB: EstimateSkew): none is applied"))
     for axis, focal in (("fx", K[0, 0]), ("fy", K[1, 1])):
         if not 0.2 * width < focal < 20 * width:
             what = f"{where}: {axis} = {focal:g} px is not plausible for an image {width} px wide"
@@ -153,13 +165,14 @@ def _check_model(file: str, eye: Eye) -> list[Finding]:
     return [Finding("warning", what, "if they are, depth is wrong: calibrate with sags calib stereo")]
 
 
-def size_made_for(rig: StereoRig) -> float | None:
-    """Return the image size that `K` was probably made for, over the size that the rig states: 0.5 for half
-    the size. None: the principal points lie near the middle, or do not agree on another size."""
+def size_made_for(rig: StereoRig, rectified: bool = False) -> float | None:
+    """Return the image size that `K`, or P, was probably made for, over the size that the rig states: 0.5
+    for half the size. None: the principal points lie near the middle, or do not agree on another size."""
     ratios = [
         ratio
         for _, eye in _eyes(rig)
-        for ratio in (2 * eye.K[0, 2] / (eye.width - 1), 2 * eye.K[1, 2] / (eye.height - 1))
+        for K in (eye.P if rectified else eye.K,)
+        for ratio in (2 * K[0, 2] / (eye.width - 1), 2 * K[1, 2] / (eye.height - 1))
     ]
     for size in OTHER_SIZES:
         if all(abs(ratio / size - 1) < SAME_CENTRE for ratio in ratios):
@@ -168,15 +181,16 @@ def size_made_for(rig: StereoRig) -> float | None:
 
 
 def _check_size(rig: StereoRig) -> list[Finding]:
-    size, eye = size_made_for(rig), rig.left
-    if size is None:
+    of_K, of_P, eye = size_made_for(rig), size_made_for(rig, rectified=True), rig.left
+    if (size := of_K or of_P) is None:
         return []
+    wrong = [*["camera_matrix"][: of_K is not None], "projection_matrix"]
     made_for = f"{eye.width * size:.0f}x{eye.height * size:.0f}"
     what = (
-        f"both principal points lie at {size:.3g} of the middle: camera_matrix is of {made_for} images, "
+        f"both principal points lie at {size:.3g} of the middle: {wrong[0]} is of {made_for} images, "
         f"the files say {eye.width}x{eye.height}"
     )
-    fix = f"if the images are {eye.width}x{eye.height}, multiply camera_matrix and projection_matrix by "
+    fix = f"if the images are {eye.width}x{eye.height}, multiply {' and '.join(wrong)} by "
     return [Finding("warning", what, f"{fix}{1 / size:.3g}, or calibrate at that size")]
 
 

@@ -13,6 +13,9 @@ from sags_node.types import I64
 Key = tuple[int, int]  # log time and header stamp of a message, ns: identify it within its topic
 
 REPEATED = 0.3  # share of distinct stamps; less is not trusted (messages recorded three times leave 1/3)
+REORDERED = 2  # images in a row that are older than one recorded before: a network exchanges single ones
+WALL = 10**18  # ns since 1970 (2001): clocks below are a simulator's or a camera's, and may begin at 0
+LONGEST_PAUSE = 600.0  # s, as of a video
 FEW_PAIRS = 0.9  # share of the left images; fewer pairs are worth a warning
 SYNCHRONISED_MS = 5.0  # ms between the eyes of a pair: the tolerance of live pairs, too
 LATE_STEPS = 1.5  # periods: the delays of both eyes to the recorder do not differ by more
@@ -51,12 +54,31 @@ def pair_messages(
 
 
 def taken(keys: Sequence[Key]) -> I64:
-    """Return when images were taken, ns: their header stamps, or their log times if most header stamps
-    repeat: then the driver did not stamp each image."""
-    both: I64 = np.array(keys, np.int64)
-    came, stamps = both[:, 0], both[:, 1]
+    """Return when images were taken, ns: their header stamps, or their log times where `_distrusted`."""
+    came, stamps = _said(keys)
+    return came if _distrusted(keys) else stamps
+
+
+def _said(keys: Sequence[Key]) -> tuple[I64, I64]:
+    """Log times and header stamps, ns; the log time where the driver left the stamp zero."""
+    came, stamps = np.array(keys, np.int64).T
+    zero = stamps == 0
+    none = zero & (stamps.max() > WALL or np.count_nonzero(zero) > 1)
+    return came, np.where(none, came, stamps)
+
+
+def _distrusted(keys: Sequence[Key]) -> str:
+    """Return what is wrong with most header stamps, so that the driver cannot have stamped each image when
+    it was taken: they repeat, or go back; "": nothing."""
+    came, stamps = _said(sorted(keys))
     distinct = len(np.unique(stamps))
-    return stamps if distinct > REPEATED * len(stamps) or distinct == len(np.unique(came)) else came
+    if distinct <= REPEATED * len(stamps) and distinct < len(np.unique(came)):
+        return f"{len(stamps)} {{}} images have {distinct} stamps"
+    older = stamps < np.maximum.accumulate(stamps)
+    if np.convolve(older, np.ones(REORDERED), "valid").max(initial=0) < REORDERED:
+        return ""
+    back = float((np.maximum.accumulate(stamps) - stamps)[older].max()) * 1e-9
+    return f"the stamps of {{}} images go back by up to {back:.3g} s: a clock was set, or a bag played again"
 
 
 def came_later(keys: Sequence[Key]) -> int:
@@ -74,11 +96,13 @@ def judge_stamps(
     repeated or uneven stamps."""
     found = []
     for eye, pictures in zip(("left", "right"), eyes, strict=True):
-        stamped = [stamp for _, stamp in pictures]
-        if not np.array_equal(taken(pictures), stamped):
-            count = len(set(stamped))
-            what = f"{len(pictures)} {eye} images have {count} stamps: when they were recorded counts instead"
+        if wrong := _distrusted(pictures):
+            what = f"{wrong.format(eye)}: when they were recorded counts instead"
             found.append(Finding("warning", what, "let the driver stamp each image when it is taken"))
+        if (np.diff([log_ns for log_ns, _ in pictures]) < 0).any():
+            what = f"{eye} images are not in the order of the times at which they were recorded, which counts"
+            fix = "was the clock set back, or were recordings joined? Then play each part alone"
+            found.append(Finding("warning", what, fix))
     came = np.array([[each[0] for each in pair] for pair in keys], np.int64)
     later = float(np.median((came - stamps) @ [-1, 1])) * 1e-6
     if rate is not None and abs(later) > LATE_STEPS * 1e3 / rate:
@@ -99,6 +123,11 @@ def judge_stamps(
         )
         fix = "let the driver stamp each image when it is taken, and record without losses"
         found.append(Finding("warning", what, fix))
+    if steps.max(initial=0) > LONGEST_PAUSE * 1e3:
+        what = f"stamps jump by {steps.max() * 1e-3:.0f} s after pair {int(np.argmax(steps))}"
+        found.append(
+            Finding("warning", what, "was the clock set? source.rate plays evenly, without the pause")
+        )
     counts = [len(set(pictures)) for pictures in eyes]
     if len(keys) < FEW_PAIRS * counts[0]:
         what = f"{len(keys)} pairs of {counts[0]} left and {counts[1]} right images"

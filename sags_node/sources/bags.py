@@ -74,15 +74,15 @@ def _read_contents(path: Path, changed: int) -> Contents:
         elif message.type == CAMERA_INFO:
             data, said = bytes(message.data), infos.setdefault(message.topic, [])
             if newest.get(message.topic) != data[STAMP_END:] and len(said) < MOST_INFOS:
-                said.append((_stamp(path, message), data))
+                said.append((_stamp(path, message) or message.log_ns, data))
             newest[message.topic] = data[STAMP_END:]
     return Contents(types, pictures, infos)
 
 
 def _stamp(path: Path, message: BagMessage) -> int:
-    """The header stamp, ns; the log time where the driver left the stamp zero."""
+    """The header stamp, ns; 0 where the driver left it out, or a simulator's clock begins."""
     try:
-        return header_stamp(message.data) or message.log_ns
+        return header_stamp(message.data)
     except SagsError as error:
         raise SagsError(f"{path}: {message.topic}: {error}") from None
 

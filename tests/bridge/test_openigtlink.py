@@ -22,12 +22,14 @@ pytest.importorskip("pyigtl", reason="no OpenIGTLink without: pip install '.[bri
 
 from pyigtl.messages import PointMessage
 
+from sags_node.cli.bridge import openigtlink
 from sags_node.clients.bridge import igtl, igtl_peers
 from sags_node.clients.bridge.igtl import MAX_BODY_BYTES
 from sags_node.clients.bridge.igtl_peers import MOST_PEERS, Peers
 from sags_node.clients.bridge.openigtlink import IgtlOptions, request_of, run_openigtlink
 from sags_node.clients.bridge.pins import Pins
 from sags_node.clients.overlay.stream import OverlayStream
+from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, transform, unproject
 from sags_node.types import FrameResult
 
@@ -367,11 +369,11 @@ def test_points_that_are_named_alike_are_all_pinned_and_given_back() -> None:
 
 
 def test_a_taken_port_and_an_unknown_output_are_said(tmp_path: Path) -> None:
-    from sags_node.errors import SagsError, UsageError
-
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(SagsError, match=f"port {port}.*choose another --port"):
             run_openigtlink(options(tmp_path, port=port), lambda *_: None, threading.Event())
-    with pytest.raises(UsageError, match="--send depth: there is picture"):
+    with pytest.raises(UsageError, match="--send depth: there is picture") as refused:
         run_openigtlink(options(tmp_path, send=("depth",)), lambda *_: None, threading.Event())
+    offered = str(refused.value).split("there is ")[1].replace(", ", ",")
+    assert f"Some of {offered};" in str([option.to_info_dict() for option in openigtlink.params])  # --help

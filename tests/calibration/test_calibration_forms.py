@@ -487,6 +487,7 @@ def with_P(row: int, column: int, factor: float, more: float = 0.0) -> Callable[
 
 
 K_LEFT = make_rig().left.K
+SKEW = np.array([[0, 3.0, 0], [0, 0, 0], [0, 0, 0]])
 
 
 @pytest.mark.parametrize(
@@ -505,6 +506,14 @@ K_LEFT = make_rig().left.K
         (with_matrix("left", "camera", K_LEFT / [[640], [640], [1]]), "not plausible"),  # of an image's width
         (with_matrix("left", "projection", np.zeros(12)), "all zeros.*one by"),
         (with_matrix("left", "camera", K_LEFT.T), "camera_matrix is transposed"),  # as MATLAB writes it
+        # scaled as a whole for images of half the size
+        (with_matrix("right", "camera", K_LEFT / 2), r"right.yaml: camera_matrix.* 0 0 0.5, not 0 0 1"),
+        (with_P(2, 2, 0.5), r"right.yaml: projection_matrix.* 0 0 0.5, not 0 0 1"),
+        (with_P(1, 0, 0, 2), "second row begins with 2"),
+        (with_matrix("left", "camera", K_LEFT + SKEW), r"left.yaml: camera_matrix: its skew of 3 px"),
+        (with_P(0, 1, 0, 3), r"right.yaml: projection_matrix: its skew of 3 px"),
+        (with_P(1, 3, 0, -3), r"projection_matrix\[7\] and \[11\] are -3 and 0"),  # one above the other
+        (with_P(2, 3, 0, 0.1), r"projection_matrix\[7\] and \[11\] are 0 and 0.1"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -514,6 +523,18 @@ def test_eyes_that_cannot_be(folder: Path, change: Callable[[Path], None], said:
         load_rig(folder)
     levels = [finding.level for finding in check_rig(read_rig(folder))]
     assert "error" in levels  # it can be read, to be reported on
+
+
+def test_a_skew_that_moves_nothing_and_rounding_are_no_fault(folder: Path) -> None:
+    with_matrix("left", "camera", K_LEFT + 0.01 * SKEW + np.diag([0, 0, 1e-9]))(folder)
+    load_rig(folder)
+
+
+def test_a_rectification_of_another_size_is_told(folder: Path) -> None:
+    for side, eye in (("left", make_rig().left), ("right", make_rig().right)):
+        with_matrix(side, "projection", np.diag([0.5, 0.5, 1]) @ eye.P)(folder)
+    said = [each.what for each in check_rig(load_rig(folder)) if each.level == "warning"]
+    assert len(said) == 1 and "at 0.5 of the middle: projection_matrix is of" in said[0]
 
 
 def test_unusual_baseline_is_only_a_warning(folder: Path) -> None:

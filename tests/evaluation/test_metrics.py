@@ -6,9 +6,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from engine_scenes import round_gaussians, rows
+from engine_scenes import as_bytes, round_gaussians, rows
 from numpy.lib.stride_tricks import sliding_window_view
 
+from sags_node.detail.motion import SmallDrawings
+from sags_node.detail.seen import SeenFrame
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.errors import UsageError
 from sags_node.geometry import unproject
@@ -16,7 +18,7 @@ from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.quality import metrics
 from sags_node.tools.evaluation.flicker import FRAMES, Flicker
 from sags_node.tools.evaluation.lpips import Lpips
-from sags_node.tools.evaluation.moments import Seen, carried
+from sags_node.tools.evaluation.moments import carried
 from sags_node.tools.evaluation.run import MappedFrame, RunFacts
 from sags_node.tools.evaluation.tracking import PointTracks
 from sags_node.types import F32, Camera, Gaussians, Snapshot
@@ -241,14 +243,18 @@ def stripes(shift_px: float) -> F32:
     return np.tile(wave[None, :, None], (CAMERA.height, 1, 3)).astype(np.float32)
 
 
-def seen(shift_px: float) -> Seen:
-    tissue = np.ones((CAMERA.height, CAMERA.width), np.bool_)
-    return Seen(sheet(shift_px), CAMERA, stripes(shift_px), tissue, 0.5)
+def seen(shift_px: float) -> SeenFrame:
+    size = CAMERA.height, CAMERA.width
+    return SeenFrame(
+        0, CAMERA, sheet(shift_px), lambda: as_bytes(stripes(shift_px)), np.ones(size, np.bool_),
+        np.full(size, DEPTH, np.float32),
+    )  # fmt: skip
 
 
-def shown(middle_px: float, *around: Seen) -> F32:
-    rasterizer = make_rasterizer("numba", CAMERA.width, CAMERA.height)
-    return carried(rasterizer, sheet(middle_px), CAMERA, around)
+def shown(middle_px: float, *around: SeenFrame) -> F32:
+    middle = sheet(middle_px)
+    planes = make_rasterizer("numba", CAMERA.width, CAMERA.height).forward(middle, CAMERA)
+    return carried(planes, middle, CAMERA, [(each, 0.5) for each in around], SmallDrawings())
 
 
 def off(picture: F32, truth: F32) -> float:
@@ -259,23 +265,23 @@ def off(picture: F32, truth: F32) -> float:
 
 def test_detail_that_gaussians_lack_goes_where_they_go() -> None:
     """A wave of 3 px times 2 pi moves by 6 px: the mean of both images as they are is grey."""
-    before, after = seen(0), seen(6)
-    assert off(shown(3, before, after), stripes(3)) < 0.01  # cubic remapping
-    assert off(before.picture / 2 + after.picture / 2, stripes(3)) > 0.05
+    assert off(shown(3, seen(0), seen(6)), stripes(3)) < 0.01  # cubic remapping
+    assert off(stripes(0) / 2 + stripes(6) / 2, stripes(3)) > 0.05
 
 
 def test_where_nothing_moves_it_is_the_mean_of_both() -> None:
     noise = np.random.default_rng(0).uniform(-0.04, 0.04, (2, *stripes(0).shape)).astype(np.float32)
-    pictures = [stripes(0) + each for each in noise]
-    around = [replace(seen(0), picture=picture) for picture in pictures]
-    np.testing.assert_allclose(shown(0, *around), pictures[0] / 2 + pictures[1] / 2, atol=1e-3)
+    first, second = (as_bytes(stripes(0) + each) for each in noise)
+    around = replace(seen(0), picture=lambda: first), replace(seen(0), picture=lambda: second)
+    np.testing.assert_allclose(shown(0, *around), (first / 2 + second / 2) / 255, atol=1e-3)
 
 
 def test_an_instrument_is_not_carried_into_the_tissue() -> None:
-    covered = seen(0)
-    covered.picture[20:40, 30:50] = 1
-    covered.tissue[20:40, 30:50] = False
-    np.testing.assert_allclose(shown(0, covered, seen(0)), stripes(0), atol=1e-3)  # from the other image
+    here = seen(0)
+    picture, mask = here.picture().copy(), here.mask.copy()
+    picture[20:40, 30:50], mask[20:40, 30:50] = 255, False
+    covered = replace(here, picture=lambda: picture, mask=mask)
+    np.testing.assert_allclose(shown(0, covered, here), here.picture() / 255, atol=1e-3)
     inside = shown(0, covered, covered)[25:35, 35:45]
     np.testing.assert_allclose(inside, 0.5, atol=0.01)  # neither shows it: the Gaussians' grey
 
@@ -283,10 +289,14 @@ def test_an_instrument_is_not_carried_into_the_tissue() -> None:
 @pytest.mark.parametrize("moved", [0.0, 0.0005])
 def test_a_camera_that_moves_is_told_from_tissue_that_does(moved: float) -> None:
     """Tissue at rest, seen from a place to the left: the image lies to the right."""
-    other = replace(
-        seen(0), camera=CAMERA.moved_right(-moved), picture=stripes(CAMERA.K[0, 0] * moved / DEPTH)
-    )
+    aside = seen(CAMERA.K[0, 0] * moved / DEPTH)
+    other = replace(aside, gaussians=sheet(0), camera=CAMERA.moved_right(-moved))
     assert off(shown(0, other), stripes(0)) < 0.01
+
+
+def test_what_another_place_saw_in_front_of_the_tissue_is_not_carried() -> None:
+    folded = replace(seen(0), camera=CAMERA.moved_right(-0.0005), depth=0.9 * seen(0).depth)
+    np.testing.assert_allclose(shown(0, folded), 0.5, atol=0.01)  # the Gaussians' grey
 
 
 # ---- tracking --------------------------------------------------------------------------------------------

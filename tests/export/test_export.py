@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -14,11 +15,14 @@ from command_line import figures_of, refused, sags
 from engine_scenes import rasterize, rows
 from running_node import RunningNode
 from splat_files import splats_of
+from warp_on_cpu import use_warp_on_cpu
 
 from sags_node.config.schema import PhantomSource
+from sags_node.engine.gpu.rasterizer import DeviceRasterizer
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import SagsError
 from sags_node.geometry import project, unproject
+from sags_node.mapping import mapper
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.received import ReceivedImage, TopicName
@@ -31,7 +35,7 @@ from sags_node.tools.export import export
 from sags_node.tools.export import scene as export_scene
 from sags_node.tools.export import surface as export_surface
 from sags_node.tools.export.orbit import orbit
-from sags_node.tools.export.scene import Scene, from_fit, from_node, from_session
+from sags_node.tools.export.scene import Scene, from_fit, from_node, from_session, scenes_of_session
 from sags_node.tools.export.surface_files import Surface
 from sags_node.tools.fitting import start
 from sags_node.types import SH_DEGREE_0
@@ -140,6 +144,28 @@ def test_colours_beyond_white_are_white(scene: Scene, tmp_path: Path, ending: st
     assert capfd.readouterr() == ("", "")
     if ending == ".pcd":
         assert np.asarray(open3d.io.read_point_cloud(tmp_path / "bright.pcd").colors).min() == 1.0
+
+
+def test_a_gpu_draws_it_and_the_cpu_where_that_fails(
+    phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_warp_on_cpu(monkeypatch)
+    first = ("source.pace:=step", "mapping.iterations:=0", "mapping.max_gaussians:=1000", "source.frames:=1")
+    monkeypatch.setattr(mapper, "FIRST_STEPS", 1)  # Warp's CPU device is slow
+    (scene,) = scenes_of_session(open_session(phantom_session, [*first, "device:=cuda"]))
+    asked = Mock(side_effect=[None, RuntimeError("CUDA error")])
+    median = DeviceRasterizer.median
+    monkeypatch.setattr(DeviceRasterizer, "median", lambda drawer: asked() or median(drawer))
+
+    clouds = []
+    for name in ("gpu", "cpu"):
+        file = tmp_path / f"{name}.ply"
+        export_surface.write_points(file, scene)
+        clouds.append(open3d.io.read_point_cloud(file))
+    gpu, cpu = clouds
+    assert asked.call_count == 2 and len(gpu.points) > 0.5 * scene.camera.width * scene.camera.height
+    apart = np.concatenate([gpu.compute_point_cloud_distance(cpu), cpu.compute_point_cloud_distance(gpu)])
+    assert np.median(apart) < 1e-6 and np.quantile(apart, 0.99) < 1e-4  # m
 
 
 @pytest.mark.parametrize("ending", [".ply", ".obj", ".stl"])
@@ -287,7 +313,7 @@ def test_a_fit_without_filters_is_drawn_without_them(phantom_session: Path, tmp_
     shown = cv2.imread(str(tmp_path / "test/000001.png"))[..., ::-1].astype(float)  # held out
 
     def off(each: Scene) -> float:
-        drawn = colours_of(each.rasterizer().forward(each.gaussians, each.camera))
+        drawn = colours_of(each.drawer().forward(each.gaussians, each.camera))
         return float(np.abs(255 * np.clip(drawn, 0, 1) - shown).max())
 
     assert off(scene) < 0.51  # rounded

@@ -21,6 +21,7 @@ from sags_node.tools.fitting.settings import (
     RowRates,
     Units,
     check_used,
+    iterations_for,
     path_frames,
     with_changes,
 )
@@ -135,6 +136,11 @@ def test_the_number_of_gaussians_follows_the_clip() -> None:
     most = ONLINE.of_clip(330_000, 2000).max_gaussians
     check_size(len(path_frames(2000)), most)
     assert 0 < most < PAPER.of_clip(330_000, 2000).max_gaussians == 100_000
+
+
+def test_the_number_of_iterations_follows_the_clip() -> None:
+    """Those of the clips on which rates were chosen, of up to 157 training frames, are 2000."""
+    assert [iterations_for(frames) for frames in (1, 157, 200, 525, 5000)] == [2000, 2000, 2400, 6300, 8000]
 
 
 @pytest.mark.parametrize("frames", [30, 63, 179, 1000])

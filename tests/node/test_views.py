@@ -13,8 +13,7 @@ from synthetic import at_frame, plane_result
 from warp_on_cpu import use_warp_on_cpu
 
 from sags_node.engine.gpu.rasterizer import DeviceRasterizer
-from sags_node.engine.interface import Rasterizer
-from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.engine.rasterizer.rasterize import Drawer
 from sags_node.errors import SagsError
 from sags_node.messaging.requests import AnchorRequest, ViewRequest, parse
 from sags_node.node import views as views_module
@@ -144,14 +143,14 @@ def test_views_are_limited_and_one_of_the_same_name_is_moved() -> None:
 
 def test_what_drew_a_size_goes_with_the_size(monkeypatch: pytest.MonkeyPatch) -> None:
     """A viewer that follows its window's size would end the node by its memory, 25 MB at a time."""
-    made: weakref.WeakSet[Rasterizer] = weakref.WeakSet()
+    made: weakref.WeakSet[Drawer] = weakref.WeakSet()
 
-    def make(backend: str, width: int, height: int) -> Rasterizer:
-        rasterizer = make_rasterizer(backend, width, height)  # type: ignore[arg-type]
-        made.add(rasterizer)
-        return rasterizer
+    def make(backend: str, width: int, height: int) -> Drawer:
+        drawer = Drawer(backend, width, height)
+        made.add(drawer)
+        return drawer
 
-    monkeypatch.setattr(views_module, "make_rasterizer", make)
+    monkeypatch.setattr(views_module, "Drawer", make)
     views, clocks = opened(0.005, a=10, b=10)
     for width in range(40, 60):
         views.open(asked("a", width=width), plane_result())
@@ -166,7 +165,7 @@ def test_what_cannot_be_drawn_costs_its_view_alone(
 ) -> None:
     views, clocks = opened(0.005, a=10, b=10)
     with monkeypatch.context() as full:
-        full.setattr(views_module, "make_rasterizer", Mock(side_effect=MemoryError))
+        full.setattr(views_module, "Drawer", Mock(side_effect=MemoryError))
         views.open(asked("a", width=48), plane_result())
         assert set(run(views, clocks, 2, {"a", "b"})) == {"b"}
         assert views.status["a"].limited_by == "it cannot be drawn: MemoryError"
@@ -234,12 +233,15 @@ def test_a_view_ahead_is_drawn_where_the_tissue_is_expected_and_says_so() -> Non
         asked("a", ahead_ms="soon")
 
 
-def test_a_view_is_drawn_on_the_gpu_and_on_the_cpu_where_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [RuntimeError("CUDA error"), Exception("a kernel cannot be loaded")])
+def test_a_view_is_drawn_on_the_gpu_and_on_the_cpu_where_that_fails(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
     use_warp_on_cpu(monkeypatch)
     scene = plane_result()
     views = Views(Allowance(), lambda: 0.0, lambda: 0.0, backend="warp")
     gpu = views.open(asked("gpu", width=64, height=48), scene)
-    monkeypatch.setattr(DeviceRasterizer, "forward", Mock(side_effect=RuntimeError("CUDA error")))
+    monkeypatch.setattr(DeviceRasterizer, "forward", Mock(side_effect=error))
     cpu = views.open(asked("cpu", width=64, height=48), scene)
     assert gpu is not None and cpu is not None
     one, other = gpu.eyes[""], cpu.eyes[""]

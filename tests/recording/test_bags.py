@@ -1,6 +1,7 @@
 """ROS recordings as sources: every kind of file, which topics, which pairs, which calibration."""
 
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -362,6 +363,58 @@ def test_stamps_that_repeat_give_way_to_the_time_of_recording(unit: int, told: i
     assert [frame.t_capture_ns for frame in frames] == [START + (40 * n + 5) * MS for n in range(30)]
     said = [each.what for each in Replay(BagSource(path=bag)).pairs.judged]
     assert len(said) == told and all("when they were recorded counts instead" in each for each in said)
+
+
+def clocked(path: Path, stamp_of: Callable[[int], int], log_of: Callable[[int], int]) -> Path:
+    """30 pairs, 40 ms apart, with these stamps and times of recording (ms); image n is `picture(n)`."""
+    names = "/rig/left/image_raw", "/rig/right/image_raw"
+    return files.write_rosbag2(path, [
+        (name, files.image(ROS2, picture(n, eye), stamp_of(n) * MS), log_of(n) * MS)
+        for n in range(30) for eye, name in enumerate(names)
+    ])  # fmt: skip
+
+
+@pytest.mark.fault("clock: set back under the cameras of a bag, or a bag was recorded that played twice")
+@pytest.mark.parametrize(
+    ("stamp_of", "said"),
+    [
+        (lambda n: START // MS + 40 * n - 130 * (n >= 15), "left images go back by up to 0.09 s"),
+        (lambda n: START // MS + 40 * n - 3_600_000 * (n >= 15), "left images go back by up to 3.6e+03 s"),
+        (lambda n: START // MS + 40 * (n % 15), "left images go back by up to 0.56 s"),
+        (lambda n: START // MS + 40 * n + 3_600_000 * (n >= 15), "jump by 3600 s after pair 14"),
+        (lambda n: 40 * n, ""),  # a simulator's clock begins at zero
+        (lambda n: (START // MS + 40 * n) * (n > 0), ""),  # one that was not stamped
+        (lambda n: START // MS + 40 * n, ""),
+    ],
+)
+def test_pictures_are_played_in_the_order_in_which_they_came(
+    tmp_path: Path, stamp_of: Callable[[int], int], said: str
+) -> None:
+    bag = clocked(tmp_path / "bag", stamp_of, lambda n: START // MS + 40 * n + 5)
+    frames = play(bag)
+    assert [int(frame.left[0, 0, 0]) for frame in frames] == [*range(30)]
+    assert [int(frame.right[0, 0, 0]) for frame in frames if frame.right is not None] == [*range(30)]
+    told = [each.what for each in Replay(BagSource(path=bag)).pairs.judged]
+    assert any(said in each for each in told) if said else not told
+
+
+def test_a_recorder_whose_clock_was_set_back_is_told_of(tmp_path: Path) -> None:
+    def set_back(n: int) -> int:
+        return START // MS + 40 * n - 130 * (n >= 15)
+
+    judged = Replay(BagSource(path=clocked(tmp_path / "bag", set_back, set_back))).pairs.judged
+    assert [each.what.split()[0] for each in judged] == ["left", "right"]
+    assert all("not in the order of the times at which they were recorded" in each.what for each in judged)
+
+
+def test_two_pictures_that_a_network_exchanged_are_put_right(tmp_path: Path) -> None:
+    def exchanged(n: int) -> int:
+        return START // MS + 40 * (n + (n == 10) - (n == 11))
+
+    bag = clocked(tmp_path / "bag", exchanged, lambda n: START // MS + 40 * n + 5)
+    shown = [int(frame.left[0, 0, 0]) for frame in play(bag)]
+    assert shown == [*range(10), 11, 10, *range(12, 30)]
+    assert Replay(BagSource(path=bag)).pairs.judged == ()
 
 
 def test_messages_that_were_recorded_twice_count_once(tmp_path: Path) -> None:

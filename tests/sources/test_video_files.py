@@ -206,6 +206,48 @@ def test_what_a_header_says_is_not_believed(tmp_path: Path, first: int, begin: f
         assert picture is not None and number_in(picture) == number + first
 
 
+X264 = "keyint=10:min-keyint=10:scenecut=0:bframes=0:cabac=0"  # with CABAC nearly all bytes mean something
+
+
+@pytest.mark.fault("file: bytes in the middle of a video are damaged")
+@pytest.mark.parametrize(
+    ("name", "codec", "options", "lost"),
+    [
+        ("a.mkv", "libx264", {"x264-params": X264}, range(14, 20)),
+        ("a.mp4", "libx264", {"x264-params": X264}, range(14, 20)),
+        ("a.mpg", "mpeg2video", {"g": "10", "b": "2000000"}, range(14, 20)),
+        ("a.mov", "prores_ks", {}, range(14, 15)),  # each image stands for itself
+        # one sweep may have begun before the damage, so one more must have ended
+        ("refresh.mkv", "libx264", {"x264-params": f"{X264}:intra-refresh=1"}, range(14, 30)),
+    ],
+)
+def test_what_was_made_up_for_damaged_bytes_is_not_shown(
+    tmp_path: Path, name: str, codec: str, options: dict[str, str], lost: range
+) -> None:
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 255, (96, 400, 3), np.uint8)
+    shown = [np.ascontiguousarray(noise[:, number : number + 128]) for number in range(40)]
+    pixels = "yuv422p10le" if codec == "prores_ks" else "yuv420p"
+    file = write(tmp_path / name, shown, codec=codec, options=options, pixels=pixels)
+    whole = [Video(file).read(number) for number in range(40)]
+    with av.open(str(file)) as container:
+        packet = [each for each in container.demux(video=0) if each.size][14]
+    data, third = bytearray(file.read_bytes()), packet.size // 3
+    begin = data.index(bytes(packet)[third : third + 64])
+    data[begin : begin + third] = rng.bytes(third)
+    file.write_bytes(data)
+    video, left_out = Video(file), []
+    for number in [*range(40), 39, 16, 5]:
+        try:
+            picture = video.read(number)
+        except SagsError as error:
+            left_out.append(number)
+            assert "copy the file again" in str(error)
+        else:
+            np.testing.assert_array_equal(picture, whole[number], f"image {number}")  # to the bit
+    assert left_out == [*lost, *({16} & {*lost})]
+
+
 def joined(file: Path, *parts: list[U8]) -> Path:
     """Streams one behind the other."""
     each = [write(file.with_name(f"{n}.ts"), part).read_bytes() for n, part in enumerate(parts)]

@@ -12,9 +12,10 @@ import numpy as np
 
 from sags_node.config.schema import LaunchConfig
 from sags_node.detail.memory import Matched, Memory
+from sags_node.detail.motion import SmallDrawings
 from sags_node.detail.seen import SeenFrame
 from sags_node.detail.show import ASIDE_EVERY, LESSON_EVERY, Detail, Lessons
-from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer, to_view
+from sags_node.engine.rasterizer.rasterize import Drawer, to_view
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import UsageError
 from sags_node.geometry import transform
@@ -26,7 +27,7 @@ from sags_node.tools.evaluation import calibration
 from sags_node.tools.evaluation.aside import Aside
 from sags_node.tools.evaluation.flicker import Flicker
 from sags_node.tools.evaluation.lpips import Lpips
-from sags_node.tools.evaluation.moments import Seen, between, carried, extrapolated
+from sags_node.tools.evaluation.moments import between, carried, extrapolated
 from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.tools.evaluation.run import MappedFrame, Run, RunFacts, ShownFrame
 from sags_node.tools.evaluation.tracking import PointTracks, TrackErrors
@@ -111,11 +112,6 @@ class _Mapped:
     shown: MappedFrame
     lent: SeenFrame  # as it lends its detail to views
 
-    def seen(self, weight: float) -> Seen:
-        """The frame as one of those whose mean `carried` takes, with a share of `weight`."""
-        snapshot = self.shown.snapshot
-        return Seen(snapshot.gaussians, snapshot.camera, self.recorded.truth, self.shown.tissue, weight)
-
 
 @dataclass(frozen=True, slots=True)
 class _HeldOut:
@@ -172,14 +168,14 @@ class Measurer:
         self._before: F32 | None = None  # the camera's image of the frame before
         self._earlier: deque[_Mapped] = deque(maxlen=PREDICTED)  # the latest first
         self._detail = Detail(Lessons()) if config.publish.detail else None
-        self._memory, self._matched = Memory(), Matched()
+        self._memory, self._matched, self._drawings = Memory(), Matched(), SmallDrawings()
         self._held: _HeldOut | None = None
         self._aside = aside
 
     @cached_property
-    def _rasterizer(self) -> Rasterizer:
+    def _drawer(self) -> Drawer:
         camera = self._rectifier.camera
-        return make_rasterizer(backend_of(self._config), camera.width, camera.height)
+        return Drawer(backend_of(self._config), camera.width, camera.height)
 
     @cached_property
     def _tissue_of(self) -> TissueMask:
@@ -324,7 +320,7 @@ class Measurer:
         Args:
             gaussians: of the frame, moved `ahead` frames.
         """
-        planes = self._rasterizer.forward(gaussians, camera)
+        planes = self._drawer.forward(gaussians, camera)
         model = colours_of(planes)
         if self._detail is None:
             return model, model
@@ -334,7 +330,8 @@ class Measurer:
 
     def _held_out(self, now: _Recorded, before: _Mapped) -> FrameRow:
         camera, truth = self._camera_of_run(now.pair.camera, before), now.truth
-        guess = self._draw(extrapolated(before.shown.snapshot, now.seconds - before.recorded.seconds), camera)
+        expected = extrapolated(before.shown.snapshot, now.seconds - before.recorded.seconds)
+        guess = colours_of(self._drawer.forward(expected, camera))
         tissue = self._tissue_of(now.frame, now.pair)
         found = self._quality(guess, now, tissue, costly=True)
         found["copy_psnr"] = metrics.psnr(before.recorded.truth, truth, tissue)
@@ -349,11 +346,12 @@ class Measurer:
             (each.recorded.seconds, each.recorded.truth) for each in (before, after)
         )
         share = (held.row.seconds - start) / (end - start)
-        middle = between(before.shown.snapshot.gaussians, after.shown.snapshot.gaussians, share)
-        around = [before.seen(1 - share), after.seen(share)]
+        middle = between(before.lent, after.lent.gaussians, share)
+        planes = self._drawer.forward(middle, held.camera)
+        around = (before.lent, 1 - share), (after.lent, share)
         pictures = {
-            "psnr": self._draw(middle, held.camera),
-            "carried_psnr": carried(self._rasterizer, middle, held.camera, around),
+            "psnr": colours_of(planes),
+            "carried_psnr": carried(planes, middle, held.camera, around, self._drawings),
             "mean_psnr": first + np.float32(share) * (last - first),
         }
         return {name: metrics.psnr(picture, held.truth, held.tissue) for name, picture in pictures.items()}
@@ -376,15 +374,12 @@ class Measurer:
             return tissue
         return self._rectifier.mask(frame.tissue) & self._tissue_of.usable
 
-    def _draw(self, gaussians: Gaussians, camera: Camera) -> F32:
-        return colours_of(self._rasterizer.forward(gaussians, camera))
-
     def _right_eye(self, shown: MappedFrame, now: _Recorded) -> dict[str, Figures]:
         if self._usable_right is None:
             exclude = self._config.vision.tissue.exclude  # boxes of the raw images, burnt into both eyes
             self._usable_right = right_pixels(self._rectifier, now.frame, exclude)
         before = self._earlier[0].recorded.pair.right if self._earlier else None
-        figures = right_figures(shown, now.pair, self._usable_right, self._rasterizer, before)
+        figures = right_figures(shown, now.pair, self._usable_right, self._drawer, before)
         return figures if shown.right_rgb is not None else {"novel": figures["novel"]}
 
     def _follow(self, shown: MappedFrame, reference: Reference, given: Camera) -> TrackErrors | None:

@@ -1,21 +1,21 @@
 """What a run says of a moment that the mapper never saw: later than its frames, or between two of them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
-from sags_node.engine.rasterizer.rasterize import Rasterizer
-from sags_node.engine.rasterizer.views import colours_of
-from sags_node.geometry import project
+from sags_node.detail.carry import EVERY, trace
+from sags_node.detail.motion import SmallDrawings
+from sags_node.detail.seen import SeenFrame
+from sags_node.engine.rasterizer.views import colours_of, to_view
+from sags_node.geometry import resized_camera
 from sags_node.model.forecast import gaussians_ahead, reached
-from sags_node.types import F32, I64, Bool, Camera, Gaussians, Snapshot
+from sags_node.types import F32, Camera, Gaussians, Snapshot
 
 VELOCITY_SHARE = 0.8  # tissue slows down: less than the last velocity predicts best (0.3 to 0.7 dB over none)
 ROUNDING = 1e-3  # s, of stamps
-INSIDE = 0.99  # least value of a carried mask: below, the place is at the edge of an instrument
-COVERED = 0.01  # least coverage of a pixel: below, the model does not say where it went
 
 
 def extrapolated(snapshot: Snapshot, seconds: float) -> Gaussians:
@@ -28,80 +28,52 @@ def extrapolated(snapshot: Snapshot, seconds: float) -> Gaussians:
     return replace(snapshot.gaussians, means=means)
 
 
-def between(before: Gaussians, after: Gaussians, share: float) -> Gaussians:
+def between(before: SeenFrame, after: Gaussians, share: float) -> Gaussians:
     """The Gaussians of a moment between two mapped frames: means and colours are interpolated linearly,
     `share` (0..1) of the way from the earlier to the later. Gaussians that the earlier one lacks are as in
     the later one."""
-    places, shared = _found(before, after)
+    rows, shared = before.rows_of(after.ids)
     left = np.where(shared, np.float32(1 - share), np.float32(0))[:, None]
     return replace(
         after,
-        means=after.means + left * (before.means[places] - after.means),
-        colors=after.colors + left * (before.colors[places] - after.colors),
+        means=after.means + left * (before.gaussians.means[rows] - after.means),
+        colors=after.colors + left * (before.gaussians.colors[rows] - after.colors),
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Seen:
-    """A moment with its image."""
-
-    gaussians: Gaussians
-    camera: Camera
-    picture: F32  # [H, W, 3] RGB 0..1
-    tissue: Bool  # [H, W]
-    weight: float  # of the image in the mean, more than 0
-
-
-def carried(rasterizer: Rasterizer, middle: Gaussians, camera: Camera, around: Sequence[Seen]) -> F32:
+def carried(
+    planes: F32,
+    middle: Gaussians,
+    camera: Camera,
+    around: Sequence[tuple[SeenFrame, float]],
+    drawings: SmallDrawings,
+) -> F32:
     """The mean of some images, carried along the model's motion to where the tissue is at another moment.
 
     Gaussians cannot say all of an image's detail, but they know where everything went. Where nothing moves
-    this is the mean of the images, whose noise is less than that of each.
+    this is the mean of the images, whose noise is less than that of each. Tissue is traced as for a view of
+    the node, but of every pixel, and looked up cubically, not rounded: a mean shows the difference.
 
     Args:
-        rasterizer: for images of the camera's size.
+        planes: [5, H, W], drawn of `middle`.
         middle: the Gaussians at that moment.
         camera: that sees it.
-        around: the moments with images.
+        around: the frames with images, and the weight of each in the mean, more than 0.
 
     Returns:
         [H, W, 3] RGB 0..1; where no image shows tissue, what the Gaussians show.
     """
-    total = np.zeros((camera.height, camera.width, 3), np.float32)
-    weights = np.zeros((camera.height, camera.width, 1), np.float32)
-    for seen in around:
-        places = _displaced(rasterizer, middle, camera, seen)
-        tissue = cv2.remap(
-            seen.tissue.astype(np.float32), places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
-        )
-        weight = np.where(tissue > INSIDE, np.float32(seen.weight), np.float32(0))[..., None]
-        total += weight * cv2.remap(
-            seen.picture, places, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
-        )
-        weights += weight
-    drawn = colours_of(rasterizer.forward(middle, camera))
-    found: F32 = np.where(weights > 0, total / np.maximum(weights, np.float32(1e-6)), drawn)
-    return np.clip(found, 0, 1)
-
-
-def _displaced(rasterizer: Rasterizer, middle: Gaussians, camera: Camera, seen: Seen) -> F32:
-    """Where each pixel's tissue is in the image of `seen`, [H, W, 2] px: displaced by the mean displacement
-    of the Gaussians drawn at the pixel. A Gaussian that is unknown in `seen` counts as not displaced."""
-    pixels, _ = project(camera, middle.means)
-    displacement = np.zeros_like(middle.colors)
-    rows, shared = _found(seen.gaussians, middle)
-    there, _ = project(seen.camera, seen.gaussians.means[rows])
-    known = shared[:, None] & np.isfinite(there) & np.isfinite(pixels)
-    displacement[:, :2] = np.where(known, there - pixels, 0)
-    planes = rasterizer.forward(replace(middle, colors=displacement, sh_rest=None, slopes=None), camera)
-    covered = planes[4] > COVERED
-    moved = np.where(covered, planes[:2] / np.where(covered, planes[4], np.float32(1)), np.float32(0))
-    places: F32 = np.moveaxis(np.indices(covered.shape, np.float32)[::-1] + moved, 0, -1)
-    return np.ascontiguousarray(places)
-
-
-def _found(others: Gaussians, gaussians: Gaussians) -> tuple[I64, Bool]:
-    """The row [N] of each Gaussian among others, and whether it is there [N]."""
-    order = np.argsort(others.ids)
-    rows = order[np.minimum(np.searchsorted(others.ids[order], gaussians.ids), len(order) - 1)]
-    return rows, others.ids[rows] == gaussians.ids
+    depth = to_view(planes, camera, 0, 0).depth
+    finer = resized_camera(camera, EVERY * camera.width, EVERY * camera.height)  # its coarse camera is ours
+    total = np.zeros((*depth.shape, 4), np.float32)
+    for source, weight in around:
+        lent = source.lent(np.inf)
+        traced = trace(depth, camera, source, lent, drawings.motion(middle, finer, source), steady=True)
+        places, share = traced.places[1:-1, 1:-1], traced.share[1:-1, 1:-1, None]
+        tissue = lent * (lent[..., 3:] / np.float32(255))  # so that no instrument's colour comes in
+        found = cv2.remap(tissue, places, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        shown = (share > 0) & (found[..., 3:] > 255 / 2)
+        total += np.where(shown, np.float32(weight) * found, np.float32(0))
+    mean: F32 = colours_of(planes)
+    np.divide(total[..., :3], total[..., 3:], out=mean, where=total[..., 3:] > 0)
+    return np.clip(mean, 0, 1)

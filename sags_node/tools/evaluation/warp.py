@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from sags_node.config.schema import Box
-from sags_node.engine.rasterizer.rasterize import Rasterizer
+from sags_node.engine.rasterizer.rasterize import Drawer
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.kernels.jit import kernel
 from sags_node.mapping.right_eye import right_eye_mask
@@ -43,7 +43,7 @@ def warp_to_right(left: F32, depth: F32, focal_px: float, baseline: float) -> tu
 
 
 def right_figures(
-    shown: MappedFrame, pair: RectifiedPair, usable: Bool, rasterizer: Rasterizer, before: U8 | None = None
+    shown: MappedFrame, pair: RectifiedPair, usable: Bool, drawer: Drawer, before: U8 | None = None
 ) -> dict[str, dict[str, float]]:
     """PSNR of the right eye's image, each after a fit of gain and offset.
 
@@ -62,7 +62,7 @@ def right_figures(
     camera, focal_px = shown.snapshot.camera, float(shown.snapshot.camera.K[0, 0])
     depths = shown.depth[shown.tissue & (shown.depth > 0)]
     mask = right_eye_mask(shown.tissue, depths, focal_px, shown.baseline) & usable
-    planes = rasterizer.forward(shown.snapshot.gaussians, camera.moved_right(shown.baseline))
+    planes = drawer.forward(shown.snapshot.gaussians, camera.moved_right(shown.baseline))
     model, truth = colours_of(planes), metrics.as_float(pair.right)
     figures = {"novel": {"psnr": metrics.fitted_psnr(model, truth, mask)}}
     warp, known = warp_to_right(metrics.as_float(pair.left), shown.measured_depth, focal_px, shown.baseline)

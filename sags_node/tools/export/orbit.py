@@ -7,8 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sags_node.engine.interface import Rasterizer
-from sags_node.engine.rasterizer.rasterize import to_view
+from sags_node.engine.rasterizer.rasterize import Drawer, to_view
 from sags_node.errors import SagsError
 from sags_node.files import whole
 from sags_node.geometry import rigid
@@ -31,9 +30,9 @@ def orbit(camera: Camera, distance: float, degrees: float, count: int) -> Iterat
         yield replace(camera, T_world_cam=camera.T_world_cam @ T)
 
 
-def picture_of(rasterizer: Rasterizer, gaussians: Gaussians, eye: Camera) -> tuple[U8, F32]:
+def picture_of(drawer: Drawer, gaussians: Gaussians, eye: Camera) -> tuple[U8, F32]:
     """The Gaussians as a camera sees them, RGB [H, W, 3], and their depth [H, W] m."""
-    view = to_view(rasterizer.forward(gaussians, eye), eye, 0, 0)
+    view = to_view(drawer.forward(gaussians, eye), eye, 0, 0)
     alpha = view.alpha[..., None]
     rgb = view.rgb * alpha + np.float32(255 * BACKGROUND) * (1 - alpha)
     return cv2.convertScaleAbs(rgb), view.depth
@@ -46,10 +45,10 @@ def write_orbit(path: Path, scene: Scene, degrees: float, seconds: float, advanc
         SagsError: the camera sees nothing of the model, or the video cannot be written.
     """
     camera, count = scene.camera, max(1, round(seconds * RATE))
-    rasterizer = scene.rasterizer()
+    drawer = scene.drawer()
 
     def draw(eye: Camera) -> tuple[U8, F32]:
-        return picture_of(rasterizer, scene.gaussians, eye)
+        return picture_of(drawer, scene.gaussians, eye)
 
     depth = draw(camera)[1]
     if not (depth > 0).any():

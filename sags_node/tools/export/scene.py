@@ -11,7 +11,7 @@ from zipfile import BadZipFile
 import msgspec
 import numpy as np
 
-from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer
+from sags_node.engine.rasterizer.rasterize import Drawer
 from sags_node.errors import SagsError, UsageError
 from sags_node.kernels.threads import configure_threads
 from sags_node.messaging.address import NodeAddress
@@ -46,10 +46,11 @@ class Scene:
     t_capture_ns: int
     held: str = ""  # as `FrameResult.held`
     antialias: bool = True  # whether it was learnt with the 2D filter
+    backend: str = "numba"  # what draws it, as for `make_rasterizer`
 
-    def rasterizer(self) -> Rasterizer:
+    def drawer(self) -> Drawer:
         """What draws it at its camera's size, as it was learnt."""
-        return make_rasterizer("numba", self.camera.width, self.camera.height, self.antialias)
+        return Drawer(self.backend, self.camera.width, self.camera.height, self.antialias)
 
 
 # ---- a running node --------------------------------------------------------------------------------------
@@ -143,8 +144,8 @@ def scenes_of_session(session: Session) -> Iterator[Scene]:
         for frame in source:
             result = pipeline.process(frame, budget)
             if not frame.warm_up:
-                snapshot = result.snapshot
-                yield Scene(snapshot.gaussians, snapshot.camera, frame.t_capture_ns, result.held)
+                shown, held = result.snapshot, result.held
+                yield Scene(shown.gaussians, shown.camera, frame.t_capture_ns, held, backend=session.backend)
 
 
 # ---- a fit -----------------------------------------------------------------------------------------------
@@ -168,19 +169,19 @@ def from_fit(folder: Path, session: Session, at: float | None, advance: Advance)
     _check_time(session, at, first_ns, last_ns)
     from_ns = last_ns if at is None else first_ns + round(at * 1e9)
     frame = next((f for f in frames if f.t_capture_ns >= from_ns), frames[-1])
-    return _scene_of(fit, frame)
+    return _scene_of(fit, frame, session)
 
 
 def scenes_of_fit(folder: Path, session: Session, advance: Advance) -> Iterator[Scene]:
     """Return what `sags fit` made of a recording, at the time of each of its frames; as `from_fit`."""
     fit, frames = _read_fit(folder, session, advance)
     for frame in frames:
-        yield _scene_of(fit, frame)
+        yield _scene_of(fit, frame, session)
 
 
-def _scene_of(fit: Fit, frame: ClipFrame) -> Scene:
-    antialias = fit.settings.antialias
-    return Scene(fit.gaussians(frame), frame.camera, frame.t_capture_ns, antialias=antialias)
+def _scene_of(fit: Fit, frame: ClipFrame, session: Session) -> Scene:
+    drawn = fit.settings.antialias, session.backend
+    return Scene(fit.gaussians(frame), frame.camera, frame.t_capture_ns, "", *drawn)
 
 
 def files_of_fit(folder: Path) -> tuple[Path, Path]:

@@ -99,7 +99,7 @@ def write_sequence(
     stamps: list[int] = []  # ns, of the images
     held: list[str] = []
     with writing(folder), tempfile.TemporaryDirectory(prefix=".sags-", dir=folder) as passing:
-        rasterizer, camera = None, None
+        drawer, camera = None, None
         for number, scene in enumerate(scenes):
             advance(number + 1, count, f"writing frames, {kept} were there")
             if scene.held:
@@ -118,10 +118,10 @@ def write_sequence(
                     raise SagsError(f"{error}: {said}") from None
                 written += 1
             size += path.stat().st_size
-            if rasterizer is None or camera is None:
+            if drawer is None or camera is None:
                 camera = scene.camera
-                rasterizer = scene.rasterizer()
-            picture, _ = picture_of(rasterizer, scene.gaussians, scene.camera)
+                drawer = scene.drawer()
+            picture, _ = picture_of(drawer, scene.gaussians, scene.camera)
             jpeg = cv2.imencode(
                 ".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
             )

@@ -84,12 +84,12 @@ def _drawn(scene: Scene, cameras: list[Camera]) -> Iterator[tuple[F32, F32]]:
     Raises:
         SagsError: the first camera sees nothing.
     """
-    rasterizer = scene.rasterizer()
+    drawer = scene.drawer()
     for camera in cameras:
-        planes = rasterizer.forward(scene.gaussians, camera)
+        planes = drawer.forward(scene.gaussians, camera)
         view = to_view(planes, camera, 0, scene.t_capture_ns)
         view = with_confidence(view, scene.gaussians)
-        apart = np.abs(view.depth - rasterizer.median()[0])
+        apart = np.abs(view.depth - drawer.median()[0])
         agree = apart < AGREEMENT_PX * view.depth / np.float32(camera.K[0, 0])
         if camera is cameras[0] and not agree.any():
             raise SagsError("the left camera sees nothing of the model; export another moment")

@@ -1,4 +1,4 @@
 """Offline fit of the deformable model to a whole clip.
 
-Imports config, engine, evaluation, field, kernels, mapping, model, pipeline, quality and vision.
+Imports config, detail, engine, evaluation, field, kernels, mapping, model, pipeline, quality and vision.
 """

@@ -8,11 +8,13 @@ from typing import Any
 import cv2
 import numpy as np
 
+from sags_node.detail.motion import SmallDrawings
+from sags_node.detail.seen import SeenFrame
 from sags_node.engine.rasterizer.views import colours_of, to_view
 from sags_node.files import whole
 from sags_node.quality import metrics
 from sags_node.tools.evaluation.lpips import Lpips
-from sags_node.tools.evaluation.moments import Seen, carried
+from sags_node.tools.evaluation.moments import carried
 from sags_node.tools.evaluation.tracking import PointTracks, TrackErrors, pooled
 from sags_node.tools.fitting.clip import ClipFrame
 from sags_node.tools.fitting.fit import Fit
@@ -75,8 +77,7 @@ def score(
     """
     rows = []
     for done, frame in enumerate(frames):
-        planes = fit.rasterizer.forward(fit.gaussians(frame), frame.camera)
-        picture = colours_of(planes)
+        picture = colours_of(fit.rasterizer.forward(fit.gaussians(frame), frame.camera))
         rows.append(_figures(picture, frame, lpips))
         if pictures is not None:
             _write(pictures / f"{frame.frame_id:06d}.png", picture)
@@ -101,24 +102,30 @@ def score_between(
         no frame lies between two.
     """
     rows: dict[str, list[dict[str, float]]] = {"carried": [], "mean": []}
+    drawings = SmallDrawings()
     for frame in frames:
         around = fit.clip.around(frame.t_capture_ns)
         if around is None:
             continue
-        before, after = around
-        span = after.t_capture_ns - before.t_capture_ns
-        share = (frame.t_capture_ns - before.t_capture_ns) / span
-        seen = [
-            Seen(fit.gaussians(near), near.camera, metrics.as_float(near.image), near.tissue, weight)
-            for near, weight in ((before, 1 - share), (after, share))
-        ]
-        shown = carried(fit.rasterizer, fit.gaussians(frame), frame.camera, seen)
-        mean = sum(np.float32(each.weight) * each.picture for each in seen)
+        begin, end = (near.t_capture_ns for near in around)
+        share = (frame.t_capture_ns - begin) / (end - begin)
+        weights, middle = (1 - share, share), fit.gaussians(frame)
+        lent = [(_seen(fit, near), weight) for near, weight in zip(around, weights, strict=True)]
+        planes = fit.rasterizer.forward(middle, frame.camera)
+        shown = carried(planes, middle, frame.camera, lent, drawings)
+        mean = sum(np.float32(weight) * metrics.as_float(seen.picture()) for seen, weight in lent)
         rows["carried"].append(_figures(shown, frame, lpips))
         rows["mean"].append(_figures(np.asarray(mean), frame, lpips))
     if not rows["mean"]:
         return None
     return {name: _summary(each, segments) for name, each in rows.items()}
+
+
+def _seen(fit: Fit, frame: ClipFrame) -> SeenFrame:
+    """A frame, with its image and the model at its time."""
+    gaussians, camera = fit.gaussians(frame), frame.camera
+    depth = to_view(fit.rasterizer.forward(gaussians, camera), camera, 0, 0).depth
+    return SeenFrame(frame.t_capture_ns, camera, gaussians, lambda: frame.image, frame.tissue, depth)
 
 
 def score_depth(fit: Fit, frames: Iterable[ClipFrame], segments: Segments) -> dict[str, Any] | None:
@@ -128,10 +135,8 @@ def score_depth(fit: Fit, frames: Iterable[ClipFrame], segments: Segments) -> di
     for frame in frames:
         if frame.reference is None or frame.reference.depth is None:
             continue
-        planes = fit.rasterizer.forward(fit.gaussians(frame), frame.camera)
-        depth = to_view(planes, frame.camera, frame.frame_id, frame.t_capture_ns).depth
-        height, width = frame.tissue.shape
-        reference = metrics.resample_nearest(frame.reference.depth, width, height)
+        depth = _seen(fit, frame).depth
+        reference = metrics.resample_nearest(frame.reference.depth, *depth.shape[::-1])
         errors = asdict(metrics.depth_errors(depth, reference, frame.tissue))
         rows.append({"frame_id": frame.frame_id, **errors})
     return _summary(rows, segments) if rows else None

@@ -24,6 +24,9 @@ PARTS: tuple[Part, ...] = ("means", "log_scales", "quats", "colors", "logits")
 
 
 LEAST = 60_000  # Gaussians at least: small images gain from more per pixel, and are drawn quickly
+# Iterations after an online start for each training frame, and at least and at most how many
+# (`benchmarks/fit.md`).
+ITERATIONS_EACH, ITERATIONS = 12, (2000, 8000)
 PATH_EVERY = 3  # training frames from one time of the paths to the next
 STEREO = LossWeights(coverage=0.1)
 MONOCULAR = {"inverse_depth": 0.0, "correlation": 1e-3}  # weights for depth up to scale and shift
@@ -208,6 +211,13 @@ ONLY_PAPER = (
     *("warm_up", "coarse", "rates.quat", "rates.color", "rates.logit", "rates.decaying", "decay_over"),
     *("stable", "growth", "batch_size", "weights", "color_softness", "slopes", "smooth_everywhere"),
 )
+
+
+def iterations_for(frames: int) -> int:
+    """The iterations of a fit after an online start that learn a clip of `frames` training frames as well as
+    a shorter one."""
+    least, most = ITERATIONS
+    return min(max(least, ITERATIONS_EACH * frames), most)
 
 
 def path_frames(frames: int) -> list[int]:
