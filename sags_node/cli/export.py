@@ -120,7 +120,7 @@ def export(
         if KINDS[kind].is_folder:
             new_folder(target)
         else:
-            check_files(target, force=force)
+            check_files(target, force=force, read=[Path(word) for word in words or ()])
     if sequence is None and not played:
         work.check_targets(targets, force)
     elif sequence is not None and (targets or at is not None or words is None):

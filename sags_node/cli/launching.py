@@ -202,10 +202,13 @@ def _pictures_text(session: Session) -> str:
     return f"{eye.width}x{eye.height} px at {source.rate:g} frames/s{assumed}{length}; {rig}"
 
 
-def check_files(*files: Path | None, force: bool | None = None) -> None:
-    """Check before a long run, with `check_file`, that the files that were asked for can be written."""
+def check_files(*files: Path | None, force: bool | None = None, read: Sequence[Path] = ()) -> None:
+    """Check before a long run, with `check_file`, that the files that were asked for can be written. What is
+    `read` stays, whatever is forced."""
     for file in files:
         if file is not None:
+            if file.resolve() in (each.resolve() for each in read):
+                raise UsageError(f"{file} is read by this command; choose another name for what it writes")
             check_file(file, force)
 
 

@@ -62,7 +62,7 @@ def register(
     from sags_node.clients.overlay.registering import register_live
     from sags_node.clients.overlay.scene import read_pairs
 
-    check_files(out, force=force)
+    check_files(out, force=force, read=(model, points))
     said, scene = register_live(model, scale, read_pairs(points), node, seconds, out)
     if json_out:
         show(said | {"scene": None if scene is None else str(out)})

@@ -358,6 +358,9 @@ def test_what_does_not_go_together_is_refused(exported: Path, tmp_path: Path) ->
     refused(2, "export", "--depth", tmp_path / "d", said=("--depth exports all frames",))
     refused(2, "export", session, "--at", "0.1", "--tracks", tmp_path / "t.npz", said=("--tracks",))
     refused(2, "export", session, "--depth", exported / "0/depth", said=("is not empty",))
+    video = tmp_path / "left.mp4"
+    video.write_bytes(b"a recording")
+    refused(2, "export", video, "--render", video, "--force", said=("is read by this command",))
 
 
 # ---- `sags export --sequence`: whole splat files, one a frame, that an interrupted export goes on with. ----

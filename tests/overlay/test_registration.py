@@ -297,5 +297,7 @@ def test_what_the_command_refuses(organ: Organ, tmp_path: Path) -> None:
         says(2, {}, "--scale", "1", said=("set scale: 0.001",))
         says(2, {}, "--scale", "5000", said=("organ.ply: scale", "or equal to 1000 (got 5000.0)"))
         says(1, {}, "--ns", "other", said=("no node runs as 'other'",))
+        for name in ("organ.ply", "pairs.yaml"):  # given again, -o counts
+            says(2, {}, "--force", "-o", files / name, said=(f"{name} is read by this command",))
         (files / "organ.ply").write_text(f"{POINT}end_header\n0 0 0\n")
         says(2, {}, said=("holds no triangles",))
