@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1955,
     "sags_node/tools/importing": 1169,
     "sags_node/vision": 5378,
-    "tests": 47039,
+    "tests": 47034,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

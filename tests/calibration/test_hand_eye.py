@@ -13,7 +13,7 @@ from drawn_boards import charuco_print, known_rig
 from places import ROOT
 
 from sags_node.config.launch_file import load_launch
-from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer
+from sags_node.engine.rasterizer.rasterize import Drawer
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert
 from sags_node.messaging import cdr, topics
@@ -32,7 +32,7 @@ from sags_node.tools.calibration.pictures import spread
 from sags_node.tools.evaluation.measure import MeasureOptions
 from sags_node.tools.evaluation.session import evaluate
 from sags_node.tools.fitting.clip import read_clip
-from sags_node.types import F32, F64, Bool, Camera, Gaussians
+from sags_node.types import F32, F64, Camera, Gaussians
 
 S, MS = 1_000_000_000, 1_000_000
 START = 1_700_000_000 * S
@@ -328,18 +328,13 @@ def test_fits_and_figures_know_where_the_robot_says_the_scope_is(
     ]  # fmt: skip
     drawn: list[Camera] = []  # from where the figures' images were
 
-    def noting(backend: str, width: int, height: int) -> Rasterizer:
-        made = make_rasterizer(backend, width, height)
-        forward = made.forward
+    forward = Drawer.forward
 
-        def noted(gaussians: Gaussians, camera: Camera, tiles: Bool | None = None) -> F32:
-            drawn.append(camera)
-            return forward(gaussians, camera, tiles)
+    def noting(drawer: Drawer, gaussians: Gaussians, camera: Camera) -> F32:
+        drawn.append(camera)
+        return forward(drawer, gaussians, camera)
 
-        monkeypatch.setattr(made, "forward", noted)
-        return made
-
-    monkeypatch.setattr("sags_node.tools.evaluation.measure.make_rasterizer", noting)
+    monkeypatch.setattr(Drawer, "forward", noting)
     session = open_session(recording, [*played, "source.frames:=4"])
     clip = read_clip(session, lambda number: number == 1)
     measured = evaluate(recording, [*played, "source.frames:=4"], MeasureOptions(hold_out=4), iterations=0)
