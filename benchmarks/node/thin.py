@@ -11,7 +11,7 @@ from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging.thin import decode, thin_pictures
 from sags_node.messaging.topics import thin_picture
-from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.pipeline.session import Session
 
 WARM_UP = 30  # frames, after which the model has its full size
@@ -39,7 +39,7 @@ def measure_thin(session: Session, frames: int, advance: Advance) -> list[dict[s
     figures: dict[str, list[tuple[float, float, int]]] = {name: [] for name in NAMES}
     with session.source as source:
         for number, frame in enumerate(source):
-            result = pipeline.process(frame, budget)
+            result = pipeline.process(frame, budget, FrameRequest(left=True))
             advance(number + 1, WARM_UP + frames, "making")
             if number < WARM_UP or result.held:
                 continue
