@@ -11,6 +11,7 @@ from sags_node.cli.launching import (
     STEPWISE,
     Number,
     as_json,
+    check_apart,
     check_files,
     file_option,
     folder_option,
@@ -120,7 +121,7 @@ def export(
         if KINDS[kind].is_folder:
             new_folder(target)
         else:
-            check_files(target, force=force, read=[Path(word) for word in words or ()])
+            check_files(target, force=force)
     if sequence is None and not played:
         work.check_targets(targets, force)
     elif sequence is not None and (targets or at is not None or words is None):
@@ -130,6 +131,8 @@ def export(
     if words is not None:
         path, changed = split_recording(words, NO_CAMERAS)
         opened = open_launched(path, [*changed, *STEPWISE])
+        read = [value for _, value in opened.config.source if isinstance(value, Path)]
+        check_apart([*played.values(), *targets.values()], [*read, *([] if path is None else [Path(path)])])
     if played:
         with progress("exporting") as advance:
             rows = write_played(opened, played, advance)

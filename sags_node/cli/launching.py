@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -202,14 +202,19 @@ def _pictures_text(session: Session) -> str:
     return f"{eye.width}x{eye.height} px at {source.rate:g} frames/s{assumed}{length}; {rig}"
 
 
-def check_files(*files: Path | None, force: bool | None = None, read: Sequence[Path] = ()) -> None:
-    """Check before a long run, with `check_file`, that the files that were asked for can be written. What is
-    `read` stays, whatever is forced."""
+def check_files(*files: Path | None, force: bool | None = None) -> None:
+    """Check before a long run, with `check_file`, that the files that were asked for can be written."""
     for file in files:
         if file is not None:
-            if file.resolve() in (each.resolve() for each in read):
-                raise UsageError(f"{file} is read by this command; choose another name for what it writes")
             check_file(file, force)
+
+
+def check_apart(written: Iterable[Path], read: Iterable[Path]) -> None:
+    """Check that no file is both written and read: --force is for files that are in the way."""
+    kept = {file.resolve() for file in read}
+    for file in written:
+        if file.resolve() in kept:
+            raise UsageError(f"{file} is read by this command; choose another name for what it writes")
 
 
 def show_outcome(summary: Mapping[str, Any], report: Path | None, verbose: bool, json_out: bool) -> None:

@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sags_node.cli.launching import as_json, check_files, file_option, force_option, positive, shown
+from sags_node.cli.launching import (
+    as_json,
+    check_apart,
+    check_files,
+    file_option,
+    force_option,
+    positive,
+    shown,
+)
 from sags_node.cli.node_options import data_options, run_dir_option
 from sags_node.errors import SagsError
 from sags_node.files import whole
@@ -62,7 +70,8 @@ def register(
     from sags_node.clients.overlay.registering import register_live
     from sags_node.clients.overlay.scene import read_pairs
 
-    check_files(out, force=force, read=(model, points))
+    check_apart((out,), (model, points))
+    check_files(out, force=force)
     said, scene = register_live(model, scale, read_pairs(points), node, seconds, out)
     if json_out:
         show(said | {"scene": None if scene is None else str(out)})

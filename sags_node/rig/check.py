@@ -184,7 +184,7 @@ def _check_size(rig: StereoRig) -> list[Finding]:
     of_K, of_P, eye = size_made_for(rig), size_made_for(rig, rectified=True), rig.left
     if (size := of_K or of_P) is None:
         return []
-    wrong = [*["camera_matrix"][: of_K is not None], "projection_matrix"]
+    wrong = ["projection_matrix"] if of_K is None else ["camera_matrix", "projection_matrix"]
     made_for = f"{eye.width * size:.0f}x{eye.height * size:.0f}"
     what = (
         f"both principal points lie at {size:.3g} of the middle: {wrong[0]} is of {made_for} images, "

@@ -16,6 +16,7 @@ from command_line import pure_json, refused, sags
 from engine_scenes import round_gaussians
 from synthetic import plane_result
 from tiny_archive import TINY_FRAMES, write_tiny_session
+from user_files import write_video
 
 from sags_lab.lerobot.dataset import LeRobot, merge
 from sags_lab.lerobot.form import COARSE, DEPTH, LEFT, POINTS, POSE, RIGHT, TASK, TISSUE, VISIBILITY, Version
@@ -24,7 +25,7 @@ from sags_node.config.schema import ReferenceConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.model.ply import write_ply
 from sags_node.pipeline.session import open_session
-from sags_node.rig import read_rig
+from sags_node.rig import read_rig, save_rig
 from sags_node.sources.source import open_source
 from sags_node.tools.export import sequence
 from sags_node.tools.export.played import DEPTH_UNIT, TRACKS
@@ -358,9 +359,14 @@ def test_what_does_not_go_together_is_refused(exported: Path, tmp_path: Path) ->
     refused(2, "export", "--depth", tmp_path / "d", said=("--depth exports all frames",))
     refused(2, "export", session, "--at", "0.1", "--tracks", tmp_path / "t.npz", said=("--tracks",))
     refused(2, "export", session, "--depth", exported / "0/depth", said=("is not empty",))
-    video = tmp_path / "left.mp4"
-    video.write_bytes(b"a recording")
-    refused(2, "export", video, "--render", video, "--force", said=("is read by this command",))
+    for eye in ("left", "right"):
+        write_video(tmp_path / f"{eye}.mp4", [getattr(pair, eye) for pair in rectified(session)])
+    save_rig(open_session(session).rig, tmp_path / "calib")
+    launch = tmp_path / "mine.yaml"
+    launch.write_text("source: {kind: videos, left: left.mp4, right: right.mp4}\nrig: calib\n")
+    for option, file in (("--render", "left.mp4"), ("--orbit", "right.mp4")):
+        into = (option, tmp_path / file, "--force")
+        refused(2, "export", launch, *into, said=(f"{file} is read by this command",))
 
 
 # ---- `sags export --sequence`: whole splat files, one a frame, that an interrupted export goes on with. ----
