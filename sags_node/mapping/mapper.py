@@ -101,7 +101,7 @@ class Mapper:
         else:
             counts = self._follow(observation, tracks, budget)
         assert self._view is not None
-        forecast = self._forecast(observation.t_capture_ns, still > 0)
+        forecast = self._forecast(observation, still > 0)
         snapshot = snapshot_of(
             self.model, observation, self.step, self._refiner.loss, counts, right, forecast
         )
@@ -276,12 +276,13 @@ class Mapper:
         if known.size:
             self._metres_per_px = float(np.median(known)) / observation.camera.K[0, 0]
 
-    def _forecast(self, t_ns: int, still: bool) -> Forecast | None:
+    def _forecast(self, observation: Observation, still: bool) -> Forecast | None:
         """Add the nodes' places in this frame to the remembered motion; return what it predicts next."""
         motion, deformation, model = self.map.motion, self.map.deformation, self.model
         if motion is None or deformation is None:
             return None
-        motion.take(deformation.nodes, deformation.seen, t_ns)
+        eye = observation.camera.T_world_cam[:3, 3].astype(np.float32)
+        motion.take(deformation.nodes, deformation.seen, observation.t_capture_ns, eye)
         expected = motion.forecast()
         if expected is None or still:
             return None

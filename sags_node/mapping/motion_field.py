@@ -49,11 +49,12 @@ class MotionField:
         self._period: float | None = None  # s, see `_found_period`
         self._stamp_ns = 0
         self._frame_s = 0.0
+        self._eye: F32 = np.zeros(3, np.float32)
         self._bases: deque[F32] = deque(maxlen=HORIZONS)  # newest first: [HORIZONS, 3, M, 3]
         self._mixed: deque[F32] = deque(maxlen=HORIZONS)  # [HORIZONS, M, 3]
         self._normal = np.zeros((HORIZONS, 3, 3))
         self._wanted = np.zeros((HORIZONS, 3))
-        self._errors = np.zeros((HORIZONS, 3))  # m^2, running: of the mix, of resting, of the last velocity
+        self._errors = np.zeros((HORIZONS, 3))  # m^2, running: of the mix, of rest, of the last velocity
         self._lags = np.zeros(2 * HISTORY)  # by frames back: weight of the moments like now
         self._trust = 0.0  # 0..1, running: weight of all such moments
 
@@ -79,8 +80,14 @@ class MotionField:
         prior[:nodes] = np.tensordot(weights[used], self._steps[used], 1)
         return prior
 
-    def take(self, nodes: F32, seen: F32, t_ns: int) -> None:
-        """Add the places [M, 3] m of all nodes at the end of a frame; new nodes come last."""
+    def take(self, nodes: F32, seen: F32, t_ns: int, eye: F32) -> None:
+        """Add the places [M, 3] m of all nodes at the end of a frame; new nodes come last.
+
+        Args:
+            seen: [M] weight of what was seen around each node.
+            eye: [3] m, world, the camera's place. Skill is that of the motion across its rays.
+        """
+        self._eye = eye
         seconds = (t_ns - self._stamp_ns) * 1e-9
         self._stamp_ns = t_ns
         if self._count and len(nodes) > self._places.shape[1]:
@@ -182,10 +189,16 @@ class MotionField:
             parts = basis[back][:, known].reshape(3, -1)
             self._normal[back] = MEMORY * self._normal[back] + parts @ parts.T
             self._wanted[back] = MEMORY * self._wanted[back] + parts @ moved
-            steady = STEADY * parts[0]
-            errors = [np.square(mixed[back, known].ravel() - moved).sum(), np.square(moved).sum()]
-            errors.append(np.square(steady - moved).sum())
-            self._errors[back] = SKILL_MEMORY * self._errors[back] + np.array(errors) / len(known)
+            off = np.stack([mixed[back, known].ravel() - moved, moved, STEADY * parts[0] - moved])
+            errors = np.square(self._across(off.reshape(3, -1, 3), known)).sum((1, 2))
+            self._errors[back] = SKILL_MEMORY * self._errors[back] + errors / len(known)
+
+    def _across(self, motion: F32, known: I64) -> F32:
+        """What the camera sees of the motion [..., K, 3] of the nodes `known`: that across its rays. Along
+        them depth, which is measured anew in each frame, hides by its noise how well motion is predicted."""
+        rays = self._places[self._count - 1, known] - self._eye
+        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), np.float32(1e-9))
+        return np.asarray(motion - (motion * rays).sum(-1, keepdims=True) * rays)
 
     def _say(self) -> None:
         """Predict the next frames from all that is remembered."""

@@ -16,6 +16,7 @@ FRAME_S = 1 / 30
 PERIOD = 31.4  # frames: no whole number
 NODES = np.random.default_rng(1).uniform(-0.03, 0.03, (200, 3)).astype(np.float32)
 SEEN = np.ones(len(NODES), np.float32)
+EYE = np.array([0, 0, -0.1], np.float32)  # m
 PULL = np.random.default_rng(2).normal(0, 1e-3, (3, len(NODES), 3))  # m
 
 
@@ -33,7 +34,7 @@ def stamp(frame: int) -> int:
 def played(places: Callable[[float], F32], frames: int) -> MotionField:
     field = MotionField()
     for frame in range(frames):
-        field.take(places(frame), SEEN, stamp(frame))
+        field.take(places(frame), SEEN, stamp(frame), EYE)
     return field
 
 
@@ -67,6 +68,19 @@ def test_what_never_repeats_is_not_said_to_be_foreseen() -> None:
     assert found[2].period is None
 
 
+def test_noise_of_depth_hides_nothing_of_what_a_camera_sees() -> None:
+    """Along a camera's rays each frame's depth has an error of its own, ten times the motion across them."""
+    rng = np.random.default_rng(4)
+
+    def measured(frame: float) -> F32:
+        rays = NODES + np.float32(frame) * np.array([1e-4, 0, 0], np.float32) - EYE
+        return EYE + rays * (1 + rng.normal(0, 1e-2, (len(NODES), 1)).astype(np.float32))
+
+    told = played(measured, 60).forecast()
+    assert told is not None and told[2].reach == pytest.approx(HORIZONS * FRAME_S)
+    assert told[2].skill > 0.5
+
+
 def test_motion_that_does_not_repeat_is_said_as_without_a_memory() -> None:
     pull = np.array([1e-3, 0, -5e-4], np.float32)
     found = played(lambda frame: NODES + np.float32(frame) * pull, 20).forecast()
@@ -94,19 +108,19 @@ def test_missed_frames_are_filled_and_a_long_gap_begins_anew() -> None:
     field, whole = MotionField(), played(beating, 121)
     for frame in range(121):
         if frame % 7 != 3:
-            field.take(beating(frame), SEEN, stamp(frame))
+            field.take(beating(frame), SEEN, stamp(frame), EYE)
     told, same = field.forecast(), whole.forecast()
     assert told is not None and same is not None
     moved = beating(121) - beating(120)
     assert off(told[0][0], moved) < 0.5 * off(np.zeros_like(moved), moved)
-    field.take(beating(400), SEEN, stamp(400))
+    field.take(beating(400), SEEN, stamp(400), EYE)
     assert field.forecast() is None
 
 
 def test_new_nodes_move_as_their_neighbours_always_did() -> None:
     field = played(beating, 100)
     near = np.concatenate([beating(100), beating(100)[:20] + np.float32(1e-4)])
-    field.take(near, np.ones(len(near), np.float32), stamp(100))
+    field.take(near, np.ones(len(near), np.float32), stamp(100), EYE)
     found = field.forecast()
     np.testing.assert_allclose(found[0][:, -20:], found[0][:, :20], atol=1e-4)
 

@@ -15,17 +15,18 @@ from sags_node.model.forecast import gaussians_ahead, reached
 from sags_node.types import F32, Camera, Gaussians, Snapshot
 
 VELOCITY_SHARE = 0.8  # tissue slows down: less than the last velocity predicts best (0.3 to 0.7 dB over none)
-ROUNDING = 1e-3  # s, of stamps
 
 
 def extrapolated(snapshot: Snapshot, seconds: float) -> Gaussians:
-    """The Gaussians `seconds` after the snapshot: by the motion field where motion is periodic and the field
-    has skill so far ahead, else by 0.8 times their last observed velocity."""
-    comes_again = snapshot.forecast is not None and snapshot.forecast.state.period is not None
-    if comes_again and 0 < seconds <= reached(snapshot, seconds) + ROUNDING:
-        return gaussians_ahead(snapshot, seconds)
-    means = snapshot.gaussians.means + snapshot.velocities * np.float32(VELOCITY_SHARE * seconds)
-    return replace(snapshot.gaussians, means=means)
+    """The Gaussians `seconds` after the snapshot, as a node's views ahead of the image show them: by its
+    forecast, no farther than that has skill for. Without one, by 0.8 times their last observed velocity."""
+    gaussians = snapshot.gaussians
+    if snapshot.forecast is not None:
+        ahead = reached(snapshot, seconds)
+        return gaussians_ahead(snapshot, ahead) if ahead > 0 else gaussians
+    return replace(
+        gaussians, means=gaussians.means + snapshot.velocities * np.float32(VELOCITY_SHARE * seconds)
+    )
 
 
 def between(before: SeenFrame, after: Gaussians, share: float) -> Gaussians:

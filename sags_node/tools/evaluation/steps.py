@@ -17,6 +17,7 @@ def run_step(
     """Process every frame in turn but those held out; time only the pipeline's work. Return the pipeline."""
     configure_threads(session.config.engine.threads)
     pipeline = Pipeline(session.config, session.rig, skips=skips)
+    pipeline.predict_motion()  # as soon as a view ahead of the image is open, and such views are measured
     budget = pipeline.make_budget()
     with session.source as source:
         for frame in source:
