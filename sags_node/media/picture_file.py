@@ -18,7 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import BmpImagePlugin, JpegImagePlugin, PngImagePlugin, PpmImagePlugin, WebPImagePlugin
+from PIL import BmpImagePlugin, Image, JpegImagePlugin, PngImagePlugin, PpmImagePlugin, WebPImagePlugin
 from PIL import TiffImagePlugin as Tiff
 from PIL.ImageFile import ImageFile
 
@@ -41,6 +41,10 @@ _ENDS = {_JPEG: b"\xff\xd9", _PNG: b"IEND\xaeB`\x82"}  # marks of an image's end
 _JPEG_MARK = re.compile(rb"\xff+([^\0\xff\xd0-\xd7])")  # but those inside pixel data
 warnings.filterwarnings("ignore", module=r"PIL\.TiffImagePlugin")  # of damaged files; they are refused
 _LONGEST_PADDING = 512  # bytes at the end of a file in which the end mark is looked for first
+# The brightest value of a PGM or PPM: the third number, behind spaces and comments.
+_PNM_WHITE = re.compile(rb"P[56](?:(?:\s|#.*\n)+(\d+)){3}")
+_TURNED = 274  # EXIF: how an image is to be shown; 1: as it is stored
+_WHITE_IS_0, _LAB, _IN_PLANES = 0, (8, 9, 10), 2  # values of TIFF tags
 _TIFF_PARTS = (Tiff.STRIPOFFSETS, Tiff.STRIPBYTECOUNTS), (Tiff.TILEOFFSETS, Tiff.TILEBYTECOUNTS)
 MAX_PIXELS = 64 << 20
 _MOST_KINDS = 32
@@ -130,22 +134,48 @@ def claimed_size(data: memoryview) -> tuple[int, int] | None:
         return None
 
 
-def pages(data: memoryview) -> int:
-    """Count the images of the first one's size in a file, such as a stack of ImageJ. Smaller ones are
-    thumbnails. 1 where the file does not tell."""
+def misread(data: memoryview, as_stored: bool) -> str:
+    """Say why OpenCV would not give what an image file holds, with a remedy after a semicolon; "": it does.
+
+    Args:
+        as_stored: it is decoded with `cv2.IMREAD_UNCHANGED`.
+    """
     try:
-        if not _is_tiff(data):
-            with closing(_opened(data)) as picture:
-                return int(getattr(picture, "n_frames", 1))
-        first, read = _tiff_tags(data), set[int]()
-        count, tags = 1, first
-        while tags.next and tags.next not in read:
-            read.add(tags.next)
-            tags = _tiff_tags(data, tags.next)
-            count += all(tags[side] == first[side] for side in (Tiff.IMAGEWIDTH, Tiff.IMAGELENGTH))
+        if _is_tiff(data):
+            return _tiff_misread(data)
+        with closing(_opened(data)) as picture:
+            turned = Image.Image.getexif(picture).get(_TURNED, 1) if as_stored else 1
+            if turned != 1:
+                return f"is to be shown turned or mirrored (EXIF orientation {turned}); save it as it is seen"
+            white = None if as_stored else _PNM_WHITE.match(data)
+            if white is not None and int(white[1]) < 255:
+                return f"would be too dark, as {int(white[1])} is white in it; save it as PNG"
+            return _several(int(getattr(picture, "n_frames", 1)))
     except Exception:  # as above
-        return 1
-    return count
+        return ""
+
+
+def _tiff_misread(data: memoryview) -> str:
+    first, read = _tiff_tags(data), set[int]()
+    tags: Any = first
+    if tags[Tiff.PHOTOMETRIC_INTERPRETATION] in _LAB:
+        return "has Lab colours; save it as RGB"
+    in_planes = tags.get(Tiff.SAMPLESPERPIXEL, 1) > 1 and tags.get(Tiff.PLANAR_CONFIGURATION) == _IN_PLANES
+    white_is_0 = tags[Tiff.PHOTOMETRIC_INTERPRETATION] == _WHITE_IS_0
+    if (in_planes or white_is_0) and max(tags.get(Tiff.BITSPERSAMPLE, (1,))) > 8:
+        return "is a deep TIFF whose white is 0, or with one colour behind the other; save it as PNG"
+    count = 1
+    while tags.next and tags.next not in read:
+        read.add(tags.next)
+        tags = _tiff_tags(data, tags.next)
+        # Smaller ones are thumbnails.
+        count += all(tags[side] == first[side] for side in (Tiff.IMAGEWIDTH, Tiff.IMAGELENGTH))
+    return _several(count)
+
+
+def _several(count: int) -> str:
+    how = "save each as a file of its own (in ImageJ: Save As, Image Sequence)"
+    return f"holds {count} images, of which one would be shown; {how}" if count > 1 else ""
 
 
 def is_whole(data: memoryview) -> bool:

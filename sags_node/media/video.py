@@ -51,6 +51,7 @@ BROKEN = (av.FFmpegError, IndexError)  # a file breaks off; PyAV, where another 
 _UNTAGGED = {2, 3}  # unspecified and reserved matrices of ISO/IEC 23091-2
 _MATRICES = {0, 1, 4, 5, 6, 7, 9}  # those of ISO/IEC 23091-2 that FFmpeg converts
 DEEP = 16  # bits of a sample
+DEEP_FORMATS = {"gray16le", "rgb48le", "gbrp16le"}
 NO_TIMES = 0x80  # AVFMT_NOTIMESTAMPS of FFmpeg
 HDR = {16: "PQ", 18: "HLG"}  # transfer characteristics of ISO/IEC 23091-2
 
@@ -430,8 +431,8 @@ def _upright(picture: U8, matrix: NDArray[np.int32]) -> U8:
 
 
 def _bits_used(frame: av.VideoFrame) -> int | None:
-    """The number of bits that 16 bit grey samples use, if it is 8 to 14; None otherwise."""
-    if frame.format.name != "gray16le":
+    """The number of bits that samples of 16 bit use, if it is 8 to 14; None otherwise."""
+    if frame.format.name not in DEEP_FORMATS:
         return None
     bits = int(frame.to_ndarray().max()).bit_length()
     return bits if 8 <= bits <= DEEP - 2 else None

@@ -18,14 +18,11 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.rig import check_intrinsics, rectified_rig
 from sags_node.sources.pictures import FolderPairs, RawPair, pair_files, read_picture, size_text
 from sags_node.sources.pose_axes import READINGS, Seen, reading_that_fits
-from sags_node.sources.truth import UNKNOWN, load_npy
+from sags_node.sources.truth import UNKNOWN, judge_depth, load_npy
 from sags_node.types import F32, F64, StereoRig
 
 # Percentiles of a frame's known depths to which all depths are clipped, as in EndoGaussian's loader.
 DEPTH_PERCENTILES = (3.0, 99.8)
-ENDOSCOPE_DEPTH = (0.01, 0.3)  # m: plausible median depth of an endoscope's frame
-FARTHEST_DEPTH = 1.0  # m: a larger median depth is refused
-DEPTH_UNITS = (1e-3, 1e-4, 1e-5, 1e-6, 1.0, 1e-3 / 256)  # m per count, the usual ones first; SERV-CT's last
 PUBLISHED = (640, 512, 569.4682)  # px: width, height and focal length of the clips of EndoNeRF
 PUBLISHED_BASELINE = 4.324e-3  # m, as their author states
 NOMINAL_BASELINE = 0.005  # m, if there is no right image: then nothing depends on it
@@ -139,34 +136,15 @@ class EndoNerfPairs(FolderPairs):
         if known.size == 0:
             return
         median, unit = float(np.median(known)), self._config.depth_unit
-        if not ENDOSCOPE_DEPTH[0] <= median <= FARTHEST_DEPTH:
-            raise UsageError(
-                f"{file}: the median depth would be {median:.3g} m, but an endoscope sees "
-                f"{ENDOSCOPE_DEPTH[0]:g} to {ENDOSCOPE_DEPTH[1]:g} m; set source.depth_unit (m per count, "
-                f"now {unit:g}){_units_that_fit(median / unit)}"
-            )
-        said = f"{file.parent}: {median * 1e3:.0f} mm (median) with {unit:g} m per count"
-        if median > ENDOSCOPE_DEPTH[1]:
-            self.oddities.append(
-                f"{said}, and an endoscope sees {ENDOSCOPE_DEPTH[0]:g} to {ENDOSCOPE_DEPTH[1]:g} m; ask who "
-                f"made it which unit it has, and set source.depth_unit{_units_that_fit(median / unit)}"
-            )
+        if far := judge_depth(file, median, unit, "source.depth_unit"):
+            self.oddities.append(far)
         elif "depth_unit" not in self._config.model_fields_set and not is_published(self._config):
             coarse = read_picture(file, cv2.IMREAD_UNCHANGED).dtype == np.uint8
+            said = f"{file.parent}: {median * 1e3:.0f} mm (median) with {unit:g} m per count"
             self.oddities.append(
                 f"{said}{', of only 8 bit' * coarse}, which the files do not say; ask who made them, and set "
                 "source.depth_unit"
             )
-
-
-def fitting_units(counts: float) -> list[float]:
-    """Return the units (m per count) in which this median count is a plausible distance for an endoscope."""
-    return [unit for unit in DEPTH_UNITS if ENDOSCOPE_DEPTH[0] <= counts * unit <= ENDOSCOPE_DEPTH[1]]
-
-
-def _units_that_fit(counts: float) -> str:
-    each = [f"{unit:g} makes {counts * unit * 1e3:.0f} mm" for unit in fitting_units(counts)]
-    return f" ({', '.join(each)})" if each else ""
 
 
 def read_llff(config: EndoNerfSource) -> Llff:

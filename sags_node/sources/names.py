@@ -8,14 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
+from sags_node.errors import UsageError
 from sags_node.types import I64
 
 log = logging.getLogger(__name__)
 
 EYE = re.compile(r"(?<![a-z])(left|right|l|r)(?![a-z])", re.IGNORECASE)
-_LAST = re.compile(r"(\d+)(?:\.(\d+))?(?=\D*$)")  # the last number of a name, and possibly its fraction
+_LAST = re.compile(r"(\d+)(?:[.,](\d+))?(?=\D*$)")  # the last number of a name, and possibly its fraction
 # Hours, minutes, seconds.
 _CLOCK = re.compile(r"(?<!\d)([01]\d|2[0-3])([-_:h]?)([0-5]\d)[-_:m]?([0-5]\d)(?!\d)")
+_HEXADECIMAL = re.compile("[0-9a-f]+", re.IGNORECASE)
 HALF_DAY = 12 * 3600  # s
 CLEARLY = 2.0  # ratio of unevenness from which on the more even order is certain
 EPOCH = 10**9, 2 * 10**9  # s since 1970: 2001 to 2033; no date such as 20260101120000 falls between
@@ -27,7 +29,12 @@ def in_order(files: Sequence[Path]) -> list[Path]:
 
     If the length of fractions varies, as in 0.067 and 0.1, they may be decimals or whole numbers (sec.nsec
     without leading zeros). Of the two orders, the one with more even steps is taken.
+
+    Raises:
+        UsageError: numbers are negative or hexadecimal, or two files have one.
     """
+    if unclear := _unclear(files):
+        raise UsageError(f"{files[0].parent}: {unclear}")
     longest = _longest(files)
     plain, times = (sorted(files, key=lambda file: (_natural(file.stem, pad), file)) for pad in (0, longest))
     if plain == times:
@@ -40,6 +47,33 @@ def in_order(files: Sequence[Path]) -> list[Path]:
             *(plain[0].parent, max(files, key=lambda file: len(file.name)).name),
         )
     return _over_midnight(plain if uneven[0] <= uneven[1] else times)
+
+
+def _unclear(files: Sequence[Path]) -> str:
+    """Say why the order of names is not that of their numbers, with a remedy after a semicolon; "": it is."""
+    named: dict[str, Path] = {}
+    longest = _longest(files)
+    for file in files:
+        key = str([_natural(file.stem, pad) for pad in (0, longest)])
+        if (other := named.setdefault(key, file)) is not file:
+            return f"{other.name} and {file.name} have one name or number; leave one of them there"
+    begins = {found.string[: found.start()] for file in files if (found := _LAST.search(file.stem))}
+    if len({begin.removesuffix("-").removesuffix("+") for begin in begins}) < len(begins):
+        return "numbers in names have signs; count from 0 up"
+    stems = [file.stem for file in files]
+    start, end = _common(stems), _common([stem[::-1] for stem in stems])
+    rests = [stem[start : len(stem) - end] for stem in stems]
+    if all(map(_HEXADECIMAL.fullmatch, rests)):
+        values = [int(rest, 16) for rest in sorted(rests, key=lambda rest: _natural(rest, 0))]
+        if values != sorted(values) and max(values) - min(values) < 2 * len(values):
+            return f"names such as {max(files).name} seem to be hexadecimal; use decimal numbers"
+    return ""
+
+
+def _common(names: Sequence[str]) -> int:
+    """The number of characters with which all names begin."""
+    differ = (at for at, each in enumerate(zip(*names, strict=False)) if len(set(each)) > 1)
+    return next(differ, min(map(len, names)))
 
 
 def _over_midnight(files: list[Path]) -> list[Path]:

@@ -14,7 +14,7 @@ from sags_node.checks import Finding, parted
 from sags_node.config.schema import Instruments, Levels
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import SHOWN, read_file
-from sags_node.media.picture_file import KINDS, SUFFIXES, decode, is_whole, pages
+from sags_node.media.picture_file import KINDS, SUFFIXES, decode, is_whole, misread
 from sags_node.sources.bag_stamps import judge_skew
 from sags_node.sources.bit_depth import EightBits
 from sags_node.sources.masks import Masks
@@ -224,7 +224,8 @@ def read_picture(file: Path, flags: int = cv2.IMREAD_COLOR) -> NDArray[Any]:
     OpenCV silently fills the missing part of a cut-off image with grey, so its end is checked first.
 
     Raises:
-        SagsError: the file is missing, no plain file, cut off, damaged, too large, or holds several.
+        SagsError: the file is missing, no plain file, cut off, damaged, too large, holds several, or is one
+            that OpenCV reads wrongly.
     """
     if flags == cv2.IMREAD_COLOR:
         samples = read_samples(file)
@@ -235,11 +236,8 @@ def read_picture(file: Path, flags: int = cv2.IMREAD_COLOR) -> NDArray[Any]:
         raise SagsError(f"cannot read image {file}: {error.strerror}") from None
     if not is_whole(memoryview(data)):
         raise SagsError(f"image {file} is damaged or cut off ({len(data)} bytes); {MEND}")
-    if (count := pages(memoryview(data))) > 1:
-        raise SagsError(
-            f"{file} holds {count} images, of which one would be shown; save each as a file of its own (in "
-            "ImageJ: Save As, Image Sequence)"
-        )
+    if reason := misread(memoryview(data), flags == cv2.IMREAD_UNCHANGED):
+        raise SagsError(f"{file} {reason}")
     return decode(data, flags, f"image {file}", MEND)
 
 
@@ -249,14 +247,14 @@ def read_samples(file: Path) -> NDArray[Any]:
     Raises:
         SagsError: as `read_picture`, or its samples have another type.
     """
-    picture = read_picture(file, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    picture = read_picture(file, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)  # grey: [H, W]
     if picture.dtype.kind == "f":
         picture = np.nan_to_num(picture, posinf=0.0, neginf=0.0).astype(np.float32)
     elif picture.dtype not in (np.uint8, np.uint16):
         raise SagsError(
             f"image {file} holds {picture.dtype}, which is not read; save it as PNG of 8 or 16 bit"
         )
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB if picture.ndim == 2 else cv2.COLOR_BGR2RGB))
 
 
 def size_text(width: int, height: int) -> str:

@@ -136,6 +136,8 @@ class Replay:
         if not self.pairs.cut_off and (beyond := references.beyond(lefts)):
             self.pairs.close()
             raise UsageError(beyond)
+        if references.oddity and not self._quiet:
+            say(references.oddity)
         if isinstance(self.pairs, FolderPairs) and not self._quiet:
             if misnamed := references.misnamed(self.pairs.files):
                 say(misnamed)

@@ -20,6 +20,10 @@ from sags_node.types import F32, F64, Bool, Reference
 UNKNOWN = 65535  # depth count for unknown, beside 0, as many programs write it
 _LARGEST = 2**31  # bytes
 FARTHEST = 1.0  # m: if a scope moves by more, millimetres were taken for metres
+FARTHEST_POINT = 10.0  # m from the base of any robot; as many millimetres are as near as an endoscope sees
+ENDOSCOPE_DEPTH = (0.01, 0.3)  # m: plausible median depth of an endoscope's frame
+FARTHEST_DEPTH = 1.0  # m: a larger median depth is refused
+DEPTH_UNITS = (1e-3, 1e-4, 1e-5, 1e-6, 1.0, 1e-3 / 256)  # m per count, the usual ones first; SERV-CT's last
 
 
 def read_poses(file: Path) -> F64:
@@ -46,21 +50,66 @@ def read_poses(file: Path) -> F64:
     return poses
 
 
+def fitting_units(counts: float) -> list[float]:
+    """Return the units (m per count) in which this median count is a plausible distance for an endoscope."""
+    return [unit for unit in DEPTH_UNITS if ENDOSCOPE_DEPTH[0] <= counts * unit <= ENDOSCOPE_DEPTH[1]]
+
+
+def judge_depth(file: Path, median: float, unit: float, key: str) -> str:
+    """Return a warning if the median depth of an image is farther than an endoscope sees; else "".
+
+    Args:
+        median: m, with `unit` (m per count), which `key` of a launch file sets.
+
+    Raises:
+        UsageError: it cannot be right.
+    """
+    each = [f"{fit:g} makes {median / unit * fit * 1e3:.0f} mm" for fit in fitting_units(median / unit)]
+    fits = f" ({', '.join(each)})" if each else ""
+    near, far = ENDOSCOPE_DEPTH
+    if not near <= median <= FARTHEST_DEPTH:
+        raise UsageError(
+            f"{file}: the median depth would be {median:.3g} m, but an endoscope sees {near:g} to {far:g} m; "
+            f"set {key} (m per count, now {unit:g}){fits}"
+        )
+    if median <= far:
+        return ""
+    return (
+        f"{file.parent}: {median * 1e3:.0f} mm (median) with {unit:g} m per count, and an endoscope sees "
+        f"{near:g} to {far:g} m; ask who made it which unit it has, and set {key}{fits}"
+    )
+
+
 class References:
     """The ground truth that comes with a recording.
 
+    Attributes:
+        oddity: a warning about the unit of its depth; "": there is none.
+
     Raises:
-        UsageError: a file or folder is missing, damaged or not of the stated form.
+        UsageError: a file or folder is missing, damaged or not of the stated form, or of another unit.
     """
 
     def __init__(self, config: ReferenceConfig) -> None:
         self._config = config
         self._depth_files = {} if config.depth is None else _by_frame_number(config.depth)
+        self.oddity = ""
+        for file in list(self._depth_files.values())[:1]:
+            depth = self._depth_in(file)
+            if (known := depth[depth > 0]).size:
+                median, key = float(np.median(known)), "source.reference.depth_unit"
+                self.oddity = judge_depth(file, median, config.depth_unit, key)
         self._tracks: dict[int, tuple[F64, Bool]] = {}  # points and their visibility, by frame number
         self._numbers: Sequence[int] = ()  # frame number of each row of the tracks; empty: row i is frame i
         if config.tracks is not None:
             points = load_array(config.tracks, "points", (None, None, 3)).astype(np.float64)
             visible = load_array(config.tracks, "visible", points.shape[:2]).astype(np.bool_)
+            seen = np.linalg.norm(points[visible], axis=-1)
+            if seen.size and np.nanmedian(seen) > FARTHEST_POINT:
+                raise UsageError(
+                    f"{config.tracks}: points are {np.nanmedian(seen):.3g} m away (median), farther than an "
+                    "endoscope sees; they are in metres: of millimetres divide them by 1000"
+                )
             self._numbers = _frame_numbers(config.tracks, len(points))
             rows = zip(points, visible, strict=True)
             self._tracks = dict(zip(self._numbers or range(len(points)), rows, strict=True))
@@ -109,15 +158,20 @@ class References:
         return Reference(depth, self._config.depth_kind, points, visible)
 
     def _read_depth(self, file: Path, size: tuple[int, int]) -> F32:
-        counts = read_picture(file, cv2.IMREAD_UNCHANGED)
-        if counts.dtype != np.uint16 or counts.ndim != 2:
-            raise SagsError(f"{file} is not a 16-bit grey PNG; reference depth must be one")
-        (height, width), (wide, high) = counts.shape, size
+        depth = self._depth_in(file)
+        (height, width), (wide, high) = depth.shape, size
         if abs(width * high - height * wide) >= max(size):  # by a whole pixel
             raise SagsError(
                 f"{file} is {size_text(width, height)} px, of another shape than the images "
                 f"({size_text(wide, high)}); reference depth must show what they show, cropped as they are"
             )
+        return depth
+
+    def _depth_in(self, file: Path) -> F32:
+        """Depth [H, W] m; 0 where unknown."""
+        counts = read_picture(file, cv2.IMREAD_UNCHANGED)
+        if counts.dtype != np.uint16 or counts.ndim != 2:
+            raise SagsError(f"{file} is not a 16-bit grey PNG; reference depth must be one")
         return np.where(counts == UNKNOWN, np.float32(0), counts * np.float32(self._config.depth_unit))
 
 

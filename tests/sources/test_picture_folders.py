@@ -1,8 +1,10 @@
 """Folders as people bring them: masks of any values, deep images, times as names, missing partners."""
 
 import re
+import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,12 +12,12 @@ import pytest
 from frames import played
 from mistakes import frames_until_error
 from numbered_pictures import HEIGHT, WIDTH, number_of, numbers, picture, write_png
-from PIL import Image
+from PIL import Image, ImageMath, ImageOps
 
 from sags_node.config import schema as cfg
 from sags_node.config.launch_file import section_of
 from sags_node.errors import SagsError, UsageError
-from sags_node.sources.pictures import say
+from sags_node.sources.pictures import read_picture, say
 from sags_node.sources.replay import Replay
 from sags_node.sources.source import open_source
 from sags_node.types import StereoFrame
@@ -250,6 +252,76 @@ def test_a_mosaic_is_told_of(pattern: str, tmp_path: Path, caplog: pytest.LogCap
     assert ("a Bayer mosaic" in caplog.text) == (set(pattern) == set("RGB"))
 
 
+HUES = cv2.applyColorMap(np.tile(np.arange(64, dtype=np.uint8) * 4, (48, 1)), cv2.COLORMAP_TURBO)[..., ::-1]
+TURNED = Image.Exif()
+TURNED[274] = 6  # by a quarter
+FILES: dict[str, tuple[str, Callable[[Image.Image], Image.Image], Any]] = {
+    "a palette": ("png", lambda shown: shown.quantize(64), {}),
+    "one bit": ("tif", lambda shown: shown.convert("1"), {"compression": "group4"}),  # 0 is white in it
+    "clear in part": ("png", lambda shown: Image.merge("RGBA", (*shown.split(), shown.getchannel(0))), {}),
+    "inks": ("jpg", lambda shown: shown.convert("CMYK"), {"quality": 98}),
+    "inks of print": ("tif", lambda shown: shown.convert("CMYK"), {}),
+    "turned": ("jpg", lambda shown: shown, {"exif": TURNED, "quality": 98, "subsampling": 0}),
+    "turned TIFF": ("tif", lambda shown: shown, {"tiffinfo": {274: 3}}),
+    "grey floats": (
+        "tif",
+        lambda shown: ImageMath.lambda_eval(lambda of: of["L"] / 255.0, L=shown.convert("F")),
+        {},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_files_of_every_form_are_seen_as_another_library_sees_them(name: str, tmp_path: Path) -> None:
+    suffix, make, options = FILES[name]
+    file = tmp_path / f"0.{suffix}"
+    make(Image.fromarray(HUES)).save(file, **options)
+    seen = ImageOps.exif_transpose(Image.open(file))
+    seen = Image.fromarray(np.asarray(seen) * 255).convert("L") if seen.mode == "F" else seen
+    assert np.abs(read_picture(file).astype(int) - np.asarray(seen.convert("RGB"))).max() <= 8
+
+
+def tag(name: int, said: int) -> bytes:
+    """An entry of a TIFF: one number of 16 bits."""
+    return struct.pack("<HHII", name, 3, 1, said)
+
+
+DEEP_TIFF = cv2.imencode(".tif", (RAMP * 65535).astype(np.uint16))[1].tobytes()
+
+
+@pytest.mark.fault("file: images whose white, colours or upright place OpenCV does not know")
+@pytest.mark.parametrize(
+    ("name", "data", "said"),
+    [
+        (
+            "0.pgm",
+            b"P5 # 255\n4 2\n100\n" + bytes(range(92, 100)),
+            "would be too dark, as 100 is white in it",
+        ),
+        ("0.ppm", b"P6\n2 1\n15\n" + bytes(6), "would be too dark, as 15 is white in it; save it as PNG"),
+        ("0.tif", DEEP_TIFF.replace(tag(262, 2), tag(262, 0)), "a deep TIFF whose white is 0"),
+        ("0.tif", DEEP_TIFF.replace(tag(284, 1), tag(284, 2)), "with one colour behind the other"),
+        ("0.tif", DEEP_TIFF.replace(tag(262, 2), tag(262, 8)), "has Lab colours; save it as RGB"),
+    ],
+)
+def test_what_would_be_seen_wrongly_is_refused(name: str, data: bytes, said: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(SagsError, match=said):
+        read_picture(tmp_path / name)
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg", "webp"])
+def test_a_mask_that_is_to_be_turned_is_refused(suffix: str, tmp_path: Path) -> None:
+    """OpenCV turns images, and leaves masks and depth as they are stored."""
+    config = eyes(tmp_path, ["0"])
+    (tmp_path / "tools").mkdir()
+    Image.fromarray(picture(0)).save(tmp_path / f"tools/0.{suffix}", exif=TURNED)
+    with pytest.raises(
+        SagsError, match=r"tools/0.\w+ is to be shown turned or mirrored \(EXIF orientation 6\)"
+    ):
+        open_source(config.model_copy(update={"tools": tmp_path / "tools"}))
+
+
 @pytest.mark.parametrize("suffix", ["tif", "png", "webp"])
 def test_a_stack_is_refused_and_a_thumbnail_passed_over(suffix: str, tmp_path: Path) -> None:
     for behind in (2, suffix == "tif"):
@@ -290,6 +362,9 @@ def day(form: str) -> list[str]:
 
 NAMES = {  # what is said of the names
     "seconds": ([f"{round(0.1 * number / 3, 3)}" for number in range(24)], ""),
+    "decimal commas": ([f"{number / 30:.4g}".replace(".", ",") for number in range(24)], ""),
+    "letters behind": ([f"f{number // 2}{'ab'[number % 2]}" for number in range(24)], ""),
+    "hexadecimal in order": ([f"f{0xA0 + number:x}" for number in range(16)], ""),
     "whole seconds too": ([f"{number / 4:g}" for number in range(24)], ""),
     "behind a word": ([f"frame_{number / 25!r}_l" for number in range(24)], ""),
     "minutes": ([f"12-{n // 12}-{n % 12 * 5 + 0.25 * (n % 2):g}" for n in range(24)], ""),
@@ -311,6 +386,30 @@ def test_names_give_the_order(name: str, tmp_path: Path, caplog: pytest.LogCaptu
     names, said = NAMES[name]
     assert numbers(played(eyes(tmp_path, names))) == list(range(len(names)))
     assert said in caplog.text and bool(said) == bool(caplog.text)
+
+
+@pytest.mark.fault("file: images are named by negative or hexadecimal numbers, or two by one")
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        ([f"f_{number - 6}" for number in range(12)], "numbers in names have signs; count from 0 up"),
+        ([f"t{number - 6:+03}" for number in range(12)], "numbers in names have signs"),
+        ([f"f{number:02x}_l" for number in range(24)], "f17_l.png seem to be hexadecimal; use decimal"),
+        ([f"0x{number:X}" for number in range(24)], "seem to be hexadecimal"),
+        (["f1", "f01", "f2"], "f0?1.png and f0?1.png have one name or number; leave one of them"),
+    ],
+)
+def test_names_that_tell_no_order_are_refused(names: list[str], said: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=f"left: .*{said}"):
+        open_source(eyes(tmp_path, names))
+
+
+@pytest.mark.fault("file: a folder holds each image as two kinds of file")
+def test_a_copy_of_an_image_is_not_the_next_one(tmp_path: Path) -> None:
+    config = eyes(tmp_path, ["0", "1"])
+    write_png(tmp_path / "right/1.tif", picture(1, 1))
+    with pytest.raises(UsageError, match=r"right: 1.\w+ and 1.\w+ have one name or number"):
+        open_source(config)
 
 
 @pytest.mark.parametrize("form", ["{0}000000", "t{0}000_x", "{0}", "{1}.{2:03}", "2023112710{3:04}"])

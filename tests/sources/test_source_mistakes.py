@@ -45,12 +45,13 @@ def measured(folder: Path) -> Recording:
     return folders_of(folder, reference=cfg.ReferenceConfig(depth=folder / "depth"))
 
 
-def write_depth(file: Path, width: int = WIDTH, height: int = HEIGHT) -> None:
-    write_png(file, np.full((height, width), 5000, np.uint16))
+def write_depth(file: Path, width: int = WIDTH, height: int = HEIGHT, counts: int = 5000) -> None:
+    write_png(file, np.full((height, width), counts, np.uint16))
 
 
-def tracked(folder: Path, frames: list[float]) -> Recording:
-    np.savez(folder / "tracks.npz", points=np.zeros((3, 5, 3)), visible=np.ones((3, 5)), frames=frames)
+def tracked(folder: Path, frames: list[float], away: float = 0.0) -> Recording:
+    points = np.full((3, 5, 3), [0.0, 0.0, away])
+    np.savez(folder / "tracks.npz", points=points, visible=np.ones((3, 5)), frames=frames)
     return folders_of(folder, reference=cfg.ReferenceConfig(tracks=folder / "tracks.npz"))
 
 
@@ -104,6 +105,9 @@ MISTAKES: list[tuple[Callable[[Path], Recording], str]] = [
      "first.png: reference depth files are named by frame number"),
     (lambda at: [write_depth(at / f"depth/{n:03d}.png") for n in range(1, 9)] and measured(at),
      "depth knows frame 8, but the recording's 8 frames are numbered from 0 to 7; number the"),
+    (lambda at: write_depth(at / "depth/000.png", counts=100) or measured(at),
+     r"000.png: the median depth would be 0.001 m.*set source.reference.depth_unit .*0.001 makes 100 mm"),
+    (lambda at: tracked(at, [0, 1, 2], 70.0), "points are 70 m away .*of millimetres divide them by 1000"),
     (lambda at: tracked(at, [1, 4, 8]), "tracks.npz knows frame 8, but the recording's 8 frames"),
     (lambda at: tracked(at, [0, 1, 1]), "'frames' must hold the frame number of each row, from 0"),
     (lambda at: tracked(at, [0.0, 0.5, 1.0]), "'frames' must hold the frame number of each row"),
@@ -124,6 +128,15 @@ def test_mistakes_at_opening(tmp_path: Path, mistake: Callable[[Path], Recording
     recordings(tmp_path)
     error = refused_at_opening(lambda: mistake(tmp_path), message)
     assert isinstance(error, UsageError) or (mistake, message) in DAMAGED
+
+
+@pytest.mark.fault("file: depth that is known to be true has another unit")
+def test_depth_beyond_an_endoscopes_view_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    recordings(tmp_path)
+    for counts, is_told in ((30_000, False), (31_000, True)):  # 0.3 m is the farthest
+        write_depth(tmp_path / "depth/000.png", counts=counts)
+        open_source(measured(tmp_path))
+        assert ("depth: 310 mm (median) with 1e-05 m per count" in caplog.text) == is_told
 
 
 def test_depth_named_by_the_next_frame_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -133,7 +133,7 @@ def with_truth(folder: Path, lefts: list[int]) -> dict[str, object]:
     T_world_cam = np.tile(np.eye(4), (len(lefts), 1, 1))
     T_world_cam[:, 0, 3] = np.array(lefts) * 1e-3
     np.savez(folder / "poses.npz", T_world_cam=T_world_cam)
-    points = np.zeros((len(lefts), 1, 3)) + np.reshape(lefts, (-1, 1, 1))
+    points = np.zeros((len(lefts), 1, 3)) + np.reshape(lefts, (-1, 1, 1)) * 1e-3
     np.savez(folder / "tracks.npz", points=points, visible=np.ones((len(lefts), 1), np.bool_))
     reference = cfg.ReferenceConfig(tracks=folder / "tracks.npz")
     return {"poses": folder / "poses.npz", "reference": reference}
@@ -141,7 +141,7 @@ def with_truth(folder: Path, lefts: list[int]) -> dict[str, object]:
 
 def check_truth(frames: list[StereoFrame], numbers: list[int]) -> None:
     assert [round(float(frame.T_world_cam[0, 3]) * 1e3) for frame in frames] == numbers  # type: ignore[index]
-    assert [int(frame.reference.points[0, 0]) for frame in frames] == numbers  # type: ignore[union-attr, index]
+    assert [round(frame.reference.points[0, 0] * 1e3) for frame in frames] == numbers  # type: ignore[union-attr, index]
 
 
 @pytest.mark.fault(
@@ -388,10 +388,14 @@ def test_eyes_that_are_interlaced_or_have_other_pixels_are_told(tmp_path: Path) 
         assert all("interlaced" in each and "deinterlace:=top" in each for each in torn)
 
 
+@pytest.mark.parametrize("pixels", ["gray16le", "rgb48le", "gbrp16le"])
 @pytest.mark.parametrize(("bits", "is_told"), [(12, True), (16, False)])
-def test_bits_that_a_deep_video_does_not_use_are_told(tmp_path: Path, bits: int, is_told: bool) -> None:
+def test_bits_that_a_deep_video_does_not_use_are_told(
+    tmp_path: Path, bits: int, is_told: bool, pixels: str
+) -> None:
     samples = np.linspace(0, 2**bits - 1, 128 * 96).astype(np.uint16).reshape(96, 128)
-    video = Video(tracks(tmp_path / "a.mkv", "gray16le", [samples], "gray16le"))
+    shown = samples if pixels == "gray16le" else np.repeat(samples[..., None], 3, axis=2)
+    video = Video(tracks(tmp_path / "a.mkv", pixels, [shown], pixels))
     picture = video.read(0)
     assert picture is not None and is_told == ("uses 12: it may be played too dark" in str(video.oddities))
     assert np.abs(picture[..., 1] - samples / 257).max() < 2

@@ -8,9 +8,8 @@ import numpy as np
 
 from sags_node.checks import Finding
 from sags_node.config.schema import GeometryConfig
-from sags_node.sources.endonerf import fitting_units
 from sags_node.sources.pictures import list_pictures, read_picture, size_text, some_of
-from sags_node.sources.truth import UNKNOWN
+from sags_node.sources.truth import UNKNOWN, fitting_units
 from sags_node.tools.calibration.matches import match_eyes
 from sags_node.types import U8, Bool
 
