@@ -17,7 +17,7 @@ import click
 from rich.markup import escape
 
 from sags_node.cli.launching import as_json, file_option, positive, shown
-from sags_node.cli.node_options import NICENESS, both_options, run_dir_option
+from sags_node.cli.node_options import NICENESS, both_options, knock, run_dir_option
 from sags_node.errors import SagsError, UsageError, install
 from sags_node.files import check_file, whole
 from sags_node.terminal.console import console, on_stop_signals, show
@@ -70,6 +70,7 @@ def _common(command: Callable[..., None]) -> Callable[..., None]:
         from sags_node.messaging.node_clock import NodeClock
         from sags_node.messaging.rundir import read_connection
 
+        knock(node)
         remote = node.endpoint is not None and node.control is not None
         clock = NodeClock.at(node) if remote else None
         overlay = NodeAddress(overlay_ns, run_dir=node.run_dir, clock=clock)  # its stamps are the node's

@@ -1,14 +1,21 @@
 """Options of commands that look for a running node."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from functools import partial, wraps
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from sags_node.cli.launching import Command, group_of
+from sags_node.terminal.console import tell
 
+if TYPE_CHECKING:
+    from sags_node.messaging.address import NodeAddress
+
+KNOCK = 3.0  # s for a refusal, which takes a few handshakes
 NICENESS = 19  # of a client's process: the node goes first, where both want the same cores
 
 WHICH_NODE = {  # said once, by `sags --help`
@@ -55,6 +62,18 @@ def node_options(command: Command) -> Command:
         command(*args, node=NodeAddress(**said, keys=client_keys(key, server_key)), **rest)
 
     return with_node
+
+
+def knock(node: NodeAddress) -> None:
+    """Hear whether the endpoint, if one is given, lets this client in: what waits for a node does not ask.
+
+    Raises:
+        SagsError: it does not.
+    """
+    from sags_node.messaging.stream import listen_to
+
+    if node.endpoint is not None and not any(listen_to(node, ["status"], KNOCK)):
+        tell(f"waiting: nothing comes from {node.endpoint}; is the node running?")
 
 
 data_options = group_of(endpoint_option, ns_option, node_options)  # for commands that listen to it

@@ -75,7 +75,7 @@ def topic_echo(
 ) -> None:
     """Print the messages of topics, bulk data as shape and range.
 
-    Warnings of their sender go to stderr.
+    Warnings of their sender go to stderr, and why it pauses.
 
     \b
     sags topic echo tf
@@ -85,7 +85,7 @@ def topic_echo(
     from sags_node.terminal.notices import Notices
 
     notices = Notices(tell)
-    for message in tool.topic_echo(names, node, count=count, warned=notices.update):
+    for message in tool.topic_echo(names, node, count=count, warned=notices.update, silent=tell):
         found: Any = part_of(message, field) if field else message
         show(json_text(found) if json_out else text.echo_text(found))
 

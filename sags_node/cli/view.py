@@ -13,7 +13,7 @@ import click
 from rich.markup import escape
 
 from sags_node.cli.launching import as_json, shown
-from sags_node.cli.node_options import NICENESS, both_options
+from sags_node.cli.node_options import NICENESS, both_options, knock
 from sags_node.errors import UsageError, install
 from sags_node.terminal.console import console, on_stop_signals, show
 
@@ -55,6 +55,7 @@ def view(port: int, host: str, insecure: bool, json_out: bool, node: NodeAddress
     from sags_node.clients.viewer.run import run_viewer
 
     os.nice(NICENESS)
+    knock(node)
 
     def ready(url: str, bound: int) -> None:
         if json_out:

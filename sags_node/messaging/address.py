@@ -210,7 +210,13 @@ class HandshakeWatch:
         return self._explained() if self._failures else None
 
     def _explained(self) -> str | None:
-        endpoint, plain = self._address.endpoint, self._address.keys is None
+        endpoint, keys = self._address.endpoint, self._address.keys
+        plain = keys is None
+        if keys is not None and keys.own.public == keys.node:
+            return (
+                f"{endpoint} refuses: --key and --server-key (client_keys) are one pair; --key takes this "
+                "client's own .key (sags keygen), --server-key the .pub of the node"
+            )
         if self._last[0] == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
             return f"{endpoint} refuses this key: have its .pub put into publish.allow, then start this anew"
         if self._last[1] == zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH:
@@ -219,9 +225,8 @@ class HandshakeWatch:
             return f"{endpoint} is not encrypted; leave out --key, or set publish.key for the node"
         if self._failures < RETRIES:
             return None
-        if plain:  # some nodes are too quick: the connection is gone before their greeting was read
-            return f"{endpoint} breaks off the connection; it probably wants a key: {_HOW}, and --server-key"
-        return (
-            f"{endpoint} breaks off the connection; is it encrypted at all, and "
-            "is --server-key (node_key) the public key of this very node?"
-        )
+        # Some nodes are too quick: the connection is gone before their greeting was read.
+        why = f"it probably wants a key: {_HOW}, and --server-key"
+        if not plain:
+            why = "is it encrypted at all, and is --server-key (node_key) the public key of this very node?"
+        return f"{endpoint} breaks off the connection; {why}"

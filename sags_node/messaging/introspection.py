@@ -32,6 +32,7 @@ from sags_node.messaging.stream import check_topic, listen_to
 
 Record = dict[str, Any]
 
+STATUS_WAIT = 1.5  # s for a `status`, which comes every second
 PATIENCE = 5.0  # s that `topic_echo` waits for the first message
 
 
@@ -82,18 +83,20 @@ def topic_echo(
     seconds: float | None = None,
     count: int | None = None,
     warned: Callable[[Mapping[str, str]], object] = lambda warnings: None,
+    silent: Callable[[str], object] = lambda why: None,
 ) -> Iterator[Record]:
     """Yield each message of one or more topics: its stamps, and its content (arrays as their range).
 
     Args:
         warned: called with the warnings (code -> text) of each `status` of the sender.
+        silent: called with the reason when the sender says that it stops sending frames.
 
     Raises:
         UsageError: there is no such topic.
         SagsError: no node is known, or nothing came within `seconds` or `PATIENCE`.
     """
     asked = [names] if isinstance(names, str) else names
-    shown = 0
+    shown, quiet = 0, None
     began = time.monotonic()
     status = topics.full_name(node.ns, "status")
     for arrived in listen_to(node, [*asked, "status"], seconds):
@@ -101,6 +104,9 @@ def topic_echo(
         if received is not None and received.topic == status:
             assert isinstance(received, ReceivedText)
             warned(received.warnings())
+            before, quiet = quiet, received.why_silent()
+            if quiet is not None and before is None:
+                silent(quiet)
             if "status" not in (topics.plain_name(node.ns, name) for name in asked):
                 received = None
         if received is None:
@@ -163,9 +169,12 @@ def topic_figures(
             **window,
         }
     if kind == "hz":
-        arrivals = [sample.arrival_ns * 1e-9 for sample in samples]
-        steps, freezes = np.diff(arrivals), freezes_of(arrivals)
-        frozen = {"freezes": freezes.count, "frozen_s": freezes.seconds}
+        moments = [*(sample.arrival_ns for sample in samples), time.time_ns()]
+        *arrivals, now = ((moment - moments[0]) * 1e-9 for moment in moments)
+        steps, freezes = np.diff(arrivals), freezes_of([*arrivals, now])  # one may last until now
+        still = freezes.count > freezes_of(arrivals).count
+        frozen: Record = {"freezes": freezes.count, "frozen_s": freezes.seconds}
+        frozen |= {"silent": _why_silent(node) or "nothing comes any more"} if still else {}
         return {"average_rate": float(1 / steps.mean()), **_spread(steps), **frozen, **window}
     ahead, bound = (None, None) if offset is None else (offset.seconds, offset.bound)
     delays = np.array([sample.arrival_ns - sample.stamp_ns for sample in samples]) * 1e-9 + (ahead or 0.0)
@@ -213,11 +222,20 @@ def _without_resent(name: str, samples: list[_Sample]) -> list[_Sample]:
 
 def _silence(topic: str, node: NodeAddress, seconds: float) -> SagsError:
     full = topics.full_name(node.ns, topics.plain_name(node.ns, topic))
-    hint = "is the node running and not waiting?"
+    hint = _why_silent(node) or "is the node running and not waiting?"
     if "/right/" in full:
         hint += f" ({topics.NO_RIGHT_EYE})"
     where = node.data().endpoint
     return SagsError(f"no messages on {full} from {where} in {seconds:g} s; {hint}")
+
+
+def _why_silent(node: NodeAddress) -> str | None:
+    """Why a sender sends no frames, as it says itself; None: it says nothing."""
+    for arrived in listen_to(node, ["status"], STATUS_WAIT):
+        status = None if arrived is None else interpret(*arrived)
+        if isinstance(status, ReceivedText):
+            return status.why_silent()
+    return None
 
 
 def _echo(received: Received) -> Record:

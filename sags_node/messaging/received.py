@@ -16,6 +16,9 @@ from sags_node.messaging.stream import check_topic
 from sags_node.messaging.wire import Buffer, Message, Meta, WireError
 from sags_node.types import F64
 
+# States of a sender with valid content. While a node is held, images are valid, and no model is sent.
+VALID_STATES = ("running", "held", "degraded")
+
 
 @dataclass(frozen=True, slots=True)
 class Received:
@@ -99,13 +102,33 @@ class ReceivedText(Received):
 
     def warnings(self) -> dict[str, str]:
         """The warnings of a `status`: code -> what is wrong and how to fix it."""
+        return self._said().warning_codes
+
+    def invalid(self) -> str | None:
+        """Why nothing that the sender of this `status` sends is valid now; None: it may be."""
+        state = self._said().state
+        if state in VALID_STATES:
+            return None
+        return f"the sender says it is {state!r}" if state else "the sender's status cannot be read"
+
+    def why_silent(self) -> str | None:
+        """Why the sender of this `status` sends no frames, or nothing of the model; None: not known."""
+        said = self._said()
+        if said.state in ("", "running", "degraded"):
+            return None
+        why = ["sags resume goes on"] if said.state == "paused" else said.warning_codes.values()
+        return "; ".join((f"the sender says it is {said.state!r}", *filter(None, (said.reason, *why))))
+
+    def _said(self) -> "_Status":
         try:
-            return msgspec.json.decode(self.text, type=_Warnings).warning_codes
+            return msgspec.json.decode(self.text, type=_Status)
         except (msgspec.MsgspecError, RecursionError):
-            return {}
+            return _Status()
 
 
-class _Warnings(msgspec.Struct):
+class _Status(msgspec.Struct):
+    state: str = ""
+    reason: str | None = None  # of an overlay that is blank
     warning_codes: dict[str, str] = {}
 
 

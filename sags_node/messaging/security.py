@@ -151,6 +151,8 @@ def _by_key(listed: Iterable[tuple[bytes, Client]]) -> dict[bytes, Client]:
 def _read(file: Path) -> tuple[bytes, bytes | None]:
     """Public and, if there is one, secret key of a certificate file; only the public one is checked."""
     try:
+        if not file.exists():
+            raise UsageError(f"there is no key file {file}; check the path, or make a pair with sags keygen")
         if not file.is_file() or file.stat().st_size > MAX_KEY_FILE_BYTES:
             raise UsageError(f"{file} is no key file; make a key pair with sags keygen")
         public, secret = load_certificate(file)

@@ -16,13 +16,12 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Self, overload
 
-import msgspec
 import zmq
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import topics
 from sags_node.messaging.address import Address, ClientKeys, Clock, NodeAddress, found
-from sags_node.messaging.freshness import Freshness, StaleError
+from sags_node.messaging.freshness import TWO_NODES, Freshness, StaleError
 from sags_node.messaging.received import Frame, R, Received, ReceivedText, TopicName, interpret
 from sags_node.messaging.sockets import Closes
 from sags_node.messaging.stream import POLL_MS, check_topic, data_socket, receive
@@ -30,13 +29,8 @@ from sags_node.messaging.wire import WireError
 from sags_node.workers import go_on
 
 KEPT = 4  # newest messages of a topic, so that topics of one frame can be joined by stamp
-# States of the node with valid content. While it is held, images are valid, and no model is sent.
-VALID_STATES = ("running", "held", "degraded")
+SILENT_AFTER = 2.5  # s without a `status`, which comes every second
 _ALWAYS = frozenset({"status"})
-
-
-class _Status(msgspec.Struct):
-    state: str = ""
 
 
 class Receiver:
@@ -234,10 +228,14 @@ class Receiver:
         if (refused := self.refused.get(name)) is not None:  # another thread may take it out
             return refused
         problem = self._fresh[name].problem(self._clock_ns(), max_age)
-        if problem is not None and (why := self.refusal or self.absent) is not None:
-            return why
+        if problem is not None:
+            status = self._newest("status")
+            said = None
+            if isinstance(status, ReceivedText) and status.age(self._clock_ns()) <= SILENT_AFTER:
+                said = status.why_silent()
+            return self.refusal or self.absent or (said if problem != TWO_NODES else None) or problem
         unknown = None if self._clock is None else self._clock.problem
-        return problem or unknown or self._sender_problem(name)
+        return unknown or self._sender_problem(name)
 
     def _sender_problem(self, name: str) -> str | None:
         """Return what the newest `status` says against the newest message of a topic."""
@@ -248,11 +246,7 @@ class Receiver:
             return "the node was started anew since"
         if newest.meta.epoch < status.meta.epoch:
             return "the recording or the model started anew since"
-        try:
-            state = msgspec.json.decode(status.text, type=_Status).state
-        except (msgspec.MsgspecError, RecursionError):
-            return "the sender's status cannot be read"
-        return None if state in VALID_STATES else f"the sender says it is {state!r}"
+        return status.invalid()
 
     # ---- the receiver thread ---------------------------------------------------------------------------
 

@@ -48,6 +48,7 @@ def topics_table(rows: Sequence[Record]) -> Table:
 
 def hz_text(figures: Record) -> str:
     frozen = f"freezes: {figures['freezes']}, {figures['frozen_s']:.2f} s in all"
+    frozen += f", still: {figures['silent']}" if "silent" in figures else ""
     return f"average rate: {figures['average_rate']:.3f} Hz\n  {_spread(figures)}\n  {frozen}"
 
 

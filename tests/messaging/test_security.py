@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import zmq
 from click.testing import CliRunner, Result
-from command_line import sags
+from command_line import refused, sags
 from independent_client import zmq_socket
 from keyed_node import TOPIC, Node, error_of, make_keys, node, of
 from running_node import RunningNode
@@ -131,6 +131,8 @@ def test_allow_lists(keys: Path, tmp_path: Path) -> None:
         (read_allow_list, [tmp_path], r"no \.pub file"),
         (read_allow_list, [keys / "node.key"], "holds a secret key"),
         (read_key_pair, keys / "node.pub", "no secret key"),
+        (read_key_pair, keys / "nobody.key", "there is no key file .*check the path, or make a pair"),
+        (read_allow_list, [keys / "clients", keys / "nobody.pub"], "there is no key file"),
     ):
         with pytest.raises(UsageError, match=said):
             read(place)
@@ -193,6 +195,8 @@ def test_a_listed_key_gets_data_and_answers(tmp_path: Path, keys: Path) -> None:
         ("stranger", "node", "refuses this key"),
         (None, "node", "wants a key"),
         ("clients/viewer", "stranger", "is --server-key (node_key) the public key of this very node"),
+        ("node", "node", "are one pair"),
+        ("clients/viewer", "clients/viewer", "are one pair"),
     ],
 )
 def test_others_are_refused_counted_and_told_why(
@@ -208,10 +212,33 @@ def test_others_are_refused_counted_and_told_why(
             with secured.asker(client, server) as asker:
                 until(lambda: why in error_of(asker))
         until(lambda: running.connections[which]["refused"] >= 1)
-        assert running.connections[which]["unlisted_key"] == (client == "stranger")
+        assert running.connections[which]["unlisted_key"] == (client in ("stranger", "node"))
         other = {"data": "control", "control": "data"}[which]
         assert running.connections[other] == dict.fromkeys(running.connections[other], 0)
         assert not running.wanted(TOPIC)
+
+
+@pytest.mark.parametrize(
+    ("command", "needed"),
+    [
+        (("view", "--port", 0), "viser"),
+        (("bridge", "web", "--port", 0), "websockets"),
+        (("bag", "record"), "mcap"),
+    ],
+)
+def test_what_waits_for_a_node_ends_where_that_refuses_it(
+    tmp_path: Path, keys: Path, command: tuple[object, ...], needed: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip(needed, reason=f"{needed} is not installed")
+    monkeypatch.setattr("sags_node.cli.node_options.KNOCK", 60.0)  # whatever else the machine does
+    monkeypatch.setattr(os, "nice", lambda increment: 0)  # that is for a process of its own
+    monkeypatch.chdir(tmp_path)
+    with node(tmp_path / "run", keys) as secured:
+        running, own = secured.running.connection, ("--key", keys / "clients/viewer.key")
+        control = () if command[0] == "bag" else ("--control", running.control)
+        where = ("--endpoint", running.data[-1], *control, *own, "--server-key", keys / "stranger.pub")
+        refused(1, *command, *where, said=("is --server-key (node_key) the public key of this very node",))
+    assert [file.name for file in tmp_path.iterdir()] == ["run"], "nothing was recorded"
 
 
 @pytest.mark.fault("keys: revoked, added and broken while it runs")

@@ -1,8 +1,10 @@
 """`sags topic`: rates, sizes and contents of a live publisher."""
 
 import json
+import re
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,16 +13,20 @@ import numpy as np
 import pytest
 from command_line import figures_of
 from made_messages import MS, meta
-from synthetic import HEIGHT, WIDTH, health, publisher, stream
-from waiting import heard, repeating
+from synthetic import HEIGHT, WIDTH, at_frame, health, plane_result, publisher, stream
+from waiting import heard, repeating, until
 
 from sags_node.clients.overlay.draw import color_key
 from sags_node.clients.overlay.stream import OverlayStream
 from sags_node.errors import SagsError, UsageError
+from sags_node.findings import by_stage
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.introspection import topic_echo, topic_figures, topic_list
+from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.wire import Message
+from sags_node.terminal.text import hz_text
+from sags_node.types import Finding
 
 pytestmark = pytest.mark.live
 
@@ -45,6 +51,7 @@ def test_figures_are_those_of_the_arrivals(monkeypatch: pytest.MonkeyPatch) -> N
         for seq, (at, size) in enumerate(zip(came, sizes, strict=True))
     ]
     monkeypatch.setattr("sags_node.messaging.introspection.listen_to", lambda *_, **__: iter([*heard, None]))
+    monkeypatch.setattr("sags_node.messaging.introspection.time.time_ns", lambda: int(1110 * MS))
     hz = topic_figures("hz", "left/depth", NOWHERE)
     assert (hz["window"], hz["freezes"]) == (4, 0)
     steps = [0.01, 0.02, 0.07]
@@ -142,6 +149,53 @@ def test_silence_and_mistakes_are_named(node: NodeAddress) -> None:
         topic_list(NodeAddress("other", node.endpoint), seconds=0.3)
     with pytest.raises(SagsError, match="no messages"):
         list(topic_echo("clock", node, seconds=0.2))
+
+
+@pytest.mark.parametrize(
+    ("state", "why"), [("paused", "sags resume goes on"), ("held", "the lens is covered")]
+)
+def test_a_node_that_sends_no_frames_says_why(tmp_path: Path, state: str, why: str) -> None:
+    said = replace(health(state), warnings=by_stage([Finding("picture_covered", "the lens is covered")]))
+    with publisher(tmp_path / "run") as running:
+
+        def serve(_: int) -> None:
+            running.publish_health(said)
+            running.poll(100)
+
+        node, told = NodeAddress(endpoint=running.connection.data[-1]), list[str]()
+        words = f"the sender says it is '{state}'.*{why}"
+        with repeating(serve), Subscriber(["anchors"], node.endpoint) as subscriber:
+            with pytest.raises(SagsError, match=f"no messages on sags/anchors .*; {words}"):
+                topic_figures("hz", "anchors", node, seconds=0.3)
+            with pytest.raises(SagsError, match=words):
+                list(topic_echo("anchors", node, seconds=1.0, silent=told.append))
+            until(lambda: re.search(words, str(subscriber.problem("anchors"))))
+        assert len(told) == 1 and re.search(words, told[0]), "once, as it does not change"
+
+
+@pytest.mark.fault("node: paused while its rate is measured")
+def test_a_rate_is_no_rate_of_now_once_nothing_comes_any_more(tmp_path: Path) -> None:
+    plane, sent = plane_result(), list[int]()
+    with publisher(tmp_path / "run") as running:
+
+        def serve(number: int) -> None:
+            goes = len(sent) < 20
+            if goes and running.wanted("left/depth"):
+                running.publish_result(at_frame(plane, number, time.time_ns()), dropped=0)
+                sent.append(number)
+            running.publish_health(health("running" if goes else "paused"))
+            running.poll(25)
+
+        def measured(seconds: float) -> dict[str, Any] | None:
+            sent.clear()
+            figures = topic_figures("hz", "left/depth", where, seconds)
+            return figures if "silent" in figures else None
+
+        where = NodeAddress(endpoint=running.connection.data[-1])
+        with repeating(serve):
+            stops = heard(measured, 3.0)
+    assert stops["freezes"] > 0 and stops["frozen_s"] > 0.15
+    assert "still: the sender says it is 'paused'" in hz_text(stops)
 
 
 def test_why_there_is_no_right_eye_is_said(tmp_path: Path) -> None:

@@ -312,3 +312,16 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
         refused(Path("/proc/nowhere/bag"), SagsError, "cannot write")
     refused(tmp_path / "none", SagsError, "no node runs as 'sags'")
     assert not (tmp_path / "none").exists()
+
+
+def test_a_recorder_that_is_refused_leaves_no_empty_bag(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def heard(*_: object) -> Iterator[None]:
+        yield None  # a refusal takes some handshakes
+        raise SagsError("this key is refused")
+
+    monkeypatch.setattr("sags_node.clients.recording.recorder.listen_to", heard)
+    with pytest.raises(SagsError, match="this key is refused"):
+        Recorder(RecordOptions(tmp_path / "bag")).run()
+    assert list(tmp_path.iterdir()) == []

@@ -350,6 +350,52 @@ def test_only_its_own_page_may_connect(view: RunningView) -> None:
         peer.connect(("127.0.0.2", port))
 
 
+def answered(port: int, *headers: str) -> str:
+    """What is said to a request for the page with these headers, sent as they are."""
+    with socket.create_connection(("127.0.0.1", port), 60) as peer, peer.makefile("rb") as stream:
+        peer.sendall("\r\n".join(("GET / HTTP/1.1", *headers, "", "")).encode())
+        head = b"".join(iter(stream.readline, b"\r\n")).decode()
+        return head if "101 Switching" in head else head + stream.readline().decode()
+
+
+def an_upgrade(host: str) -> tuple[str, ...]:
+    """The headers of a websocket that the page under this host opens to where it came from."""
+    said = ("Host: ", "Origin: http://")
+    key = ("Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Key: MDEyMzQ1Njc4OTAxMjM0NQ==")
+    protocol = f"Sec-WebSocket-Protocol: viser-v{version('viser')}"
+    return (*(name + host for name in said), *key, "Sec-WebSocket-Version: 13", protocol)
+
+
+@pytest.mark.fault("network: a hostile page reaches the viewer by a name of its own for this machine")
+def test_it_answers_by_its_own_addresses_only(view: RunningView) -> None:
+    port = view.port
+    for own in (f"127.0.0.1:{port}", f"localhost:{port}", f"LocalHost:{port}", f"[::1]:{port}"):
+        assert "200 OK" in answered(port, f"Host: {own}") and "101 " in answered(port, *an_upgrade(own))
+    rebound, elsewhere = f"example.org:{port}", f"localhost:{port + 1}"
+    others = (rebound, elsewhere, "localhost", f"127.0.0.1:{port}.org", f"10.0.0.1:{port}", "")
+    for host in ((f"Host: {other}",) for other in others):
+        refusal = answered(port, *host)
+        assert "403 " in refusal and f"Open {view.url};" in refusal
+    assert "403 " in answered(port), "no name at all"
+    assert "403 " in answered(port, f"Host: localhost:{port}", f"Host: {rebound}"), "two"
+    for other in others:
+        assert "403 " in answered(port, *an_upgrade(other))
+    assert "403 " in answered(port, f"Host: localhost:{port}", *an_upgrade(rebound)[1:])
+
+
+@pytest.mark.usefixtures("viser")
+def test_open_to_the_network_it_answers_by_numbers_and_the_machines_name() -> None:
+    from sags_node.clients.viewer.server import serving
+
+    with serving("0.0.0.0", 0, True) as (server, _):
+        port = server.get_port()
+        for own in ("10.1.2.3", "[fe80::1]", "localhost", socket.gethostname()):
+            assert "101 " in answered(port, *an_upgrade(f"{own}:{port}"))
+        for other in ("example.org", f"{socket.gethostname()}.example.org", "10.example.org", "1.2.3.4.de"):
+            assert "403 " in answered(port, *an_upgrade(f"{other}:{port}"))
+            assert "403 " in answered(port, f"Host: {other}:{port}")
+
+
 # ---- in a browser ----------------------------------------------------------------------------------------
 
 

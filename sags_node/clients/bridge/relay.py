@@ -17,7 +17,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import topics
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.received import Frame, Received
-from sags_node.messaging.subscriber import Subscriber
+from sags_node.messaging.subscriber import SILENT_AFTER, Subscriber
 from sags_node.messaging.wire import Meta
 
 MAX_AGE = 0.4  # s since capture: with `LOOK` and the way to a peer, what stops is gone within 0.5 s
@@ -28,7 +28,6 @@ GRACE = 0.5  # s for the first message of what was asked for, before it is said 
 LEAST_HZ = 0.5  # Hz; a bridge passes on the newest message, so lost ones are no fault; old ones are
 AGAIN = 1.0  # s until a report with other reasons only: the ages in them grow all the time
 EVERY_SECOND = ("status", "diagnostics")
-SILENT_AFTER = 2.5  # s without one of these
 
 
 @dataclass(frozen=True, slots=True)

@@ -207,9 +207,13 @@ class Recorder:
                 for arrived in chain((first,), messages):
                     if arrived is not None and not backlog.put(arrived):
                         self._topics[arrived.message.topic].dropped += 1
+            except SagsError as refusal:
+                self._error = refusal
             finally:
                 backlog.close()
                 thread.join()
+            if self._error is not None and not writer.bag.messages:
+                writer.bag.discard()
 
     def _write(self, writer: MessageWriter, backlog: Backlog) -> None:
         """The second thread."""

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from sags_node.clients.viewer.overlay import LEAST_HZ, SILENT_AFTER, Overlay, OverlayFeed
+from sags_node.clients.viewer.overlay import LEAST_HZ, Overlay, OverlayFeed
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.node_clock import NodeClock
 from sags_node.messaging.received import (
@@ -23,7 +23,7 @@ from sags_node.messaging.received import (
     ReceivedRos,
     ReceivedText,
 )
-from sags_node.messaging.subscriber import Subscriber
+from sags_node.messaging.subscriber import SILENT_AFTER, Subscriber
 from sags_node.messaging.wire import WireError
 from sags_node.types import U8, Camera
 

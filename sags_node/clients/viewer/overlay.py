@@ -6,14 +6,13 @@ from pathlib import Path
 import msgspec
 
 from sags_node.messaging.received import ReceivedImage, ReceivedText, TopicName
-from sags_node.messaging.subscriber import Subscriber
+from sags_node.messaging.subscriber import SILENT_AFTER, Subscriber
 from sags_node.types import U8
 
 NS = "overlay"  # default namespace of its topics and its connection file
 EYES = {eye: TopicName(f"{eye}/overlay/image", ReceivedImage) for eye in ("left", "right")}
 LEAST_HZ = 1e-3  # Hz; it is looked at now and then, so lost images are no fault
 WAIT = 0.1  # s for the overlay of a frame: it takes some ms to draw
-SILENT_AFTER = 2.5  # s without a `status`, which comes every second
 
 
 class Thing(msgspec.Struct, frozen=True):

@@ -1,5 +1,6 @@
 """viser on this machine only: it has no keys, so nobody else may reach it."""
 
+import http
 import re
 import socket
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ from sags_node.clients.viewer import cursor, still
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.security import is_loopback
 
+HTTP = 80  # the port that a browser leaves out
 # viser 1.1.1 gives two numbers for each corner of a splat's quad, and three.js reads three: it reports a
 # bounding sphere of radius NaN, and culls nothing. A large third number is not drawn, and culls nothing, too.
 MEND = """<script>
@@ -39,8 +41,10 @@ class _LocalServer(viser.ViserServer):
 def serving(host: str, port: int, insecure: bool) -> Iterator[tuple[viser.ViserServer, str]]:
     """The server and its address, until the end of the block.
 
-    On loopback, only pages of this server may open its websocket: else any page that the user has open could
-    read the images and press the buttons. With `insecure`, pages of any host name may open it, on its port.
+    Only pages of this server may open its websocket: else any page that the user has open could read the
+    images and press the buttons. It answers by its own addresses only: a name that somebody else gave this
+    machine would make his page one of ours (DNS rebinding). With `insecure` those are all numbers and the
+    machine's name.
 
     Args:
         port: 0 for any free one.
@@ -55,10 +59,13 @@ def serving(host: str, port: int, insecure: bool) -> Iterator[tuple[viser.ViserS
             "leave it out and look from elsewhere through ssh -L, or give --insecure"
         )
     port = _bindable(host, port)
-    url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
-    names = "|".join(map(re.escape, (f"[{host}]" if ":" in host else host, "127.0.0.1", "localhost")))
-    origin = re.compile(rf"https?://.*:{port}" if insecure else rf"http://({names}):{port}")
-    with redirect_stdout(StringIO()), _only_from(origin):
+    own = f"[{host}]" if ":" in host else host
+    url = f"http://{own}:{port}"
+    names = [own, "127.0.0.1", "localhost", "[::1]"]
+    names += [socket.gethostname(), socket.getfqdn()] if insecure else []
+    any_number = [r"[\d.]+", r"\[[\da-f:.]+\]"] if insecure else []  # which nobody can give to this machine
+    hosts = rf"({'|'.join([*map(re.escape, names), *any_number])})(:{port}{'|' if port == HTTP else ''})"
+    with redirect_stdout(StringIO()), _answering(hosts, url):
         server = _LocalServer(host=host, port=port, verbose=False)
     try:
         if server.get_port() != port:
@@ -84,9 +91,18 @@ def _bindable(host: str, port: int) -> int:
 
 
 def _answer(
-    answer: Callable[[Any, Request], Response | None], connection: Any, request: Request
+    answer: Callable[[Any, Request], Response | None],
+    own: re.Pattern[str],
+    url: str,
+    connection: Any,
+    request: Request,
 ) -> Response | None:
-    """viser's answer; its page gets our scripts."""
+    """viser's answer, to who asks by an address of our `own`; its page gets our scripts."""
+    asked = request.headers.get_all("Host")
+    if len(asked) != 1 or own.fullmatch(asked[0]) is None:
+        said = f"sags view does not answer by this address. Open {url}; use the same port with ssh -L\n"
+        refusal: Response = connection.respond(http.HTTPStatus.FORBIDDEN, said)
+        return refusal
     if "Accept-Encoding" in request.headers:
         del request.headers["Accept-Encoding"]  # so that the page can be read here
     response = answer(connection, request)
@@ -100,12 +116,14 @@ def _answer(
 
 
 @contextmanager
-def _only_from(origin: re.Pattern[str]) -> Iterator[None]:
-    """Patch websockets' `serve`: viser has no setting for the origins that it accepts, nor for its page."""
+def _answering(hosts: str, url: str) -> Iterator[None]:
+    """Patch websockets' `serve`: viser has no setting for whom it answers, nor for its page."""
     serve = websockets.asyncio.server.serve
+    own, origin = (re.compile(scheme + hosts, re.IGNORECASE) for scheme in ("", "https?://"))
 
     def served(*args: Any, process_request: Any, **options: Any) -> Any:
-        return serve(*args, process_request=partial(_answer, process_request), origins=[origin], **options)
+        answer = partial(_answer, process_request, own, url)
+        return serve(*args, process_request=answer, origins=[origin], **options)
 
     websockets.asyncio.server.serve = served  # type: ignore[assignment, misc]  # as above
     try:
