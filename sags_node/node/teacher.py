@@ -61,7 +61,7 @@ class Teacher:
         now, *older = seen
         if ahead > 0:
             self._learn_ahead(now)
-        if not np.array_equal(*(camera.T_world_cam[:3, 3] for camera in (view.camera, now.camera))):
+        if np.any(view.camera.T_world_cam[:3, 3] != now.camera.T_world_cam[:3, 3]):
             self._learn_aside(scene, now)
         if now.whole is None:
             if self._whole is None or self._whole.t_capture_ns != now.t_capture_ns:
