@@ -227,9 +227,7 @@ def on_stop_signals(stop: Callable[[], None]) -> None:
         if now - first.setdefault(number, now) > SAME_SIGNAL:
             interrupt(number, frame)
         else:
-            start_new_thread(
-                stop, ()
-            )  # here it could wait for a lock that what it interrupts holds: for ever
+            start_new_thread(stop, ())  # here it could wait for a lock that what it interrupts holds
 
     signal.signal(signal.SIGINT, handle)
     signal.signal(signal.SIGTERM, handle)
