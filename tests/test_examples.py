@@ -88,6 +88,22 @@ def test_all_start_and_end_together_and_the_notebook_plots_what_was_recorded(
     )
 
 
+@pytest.mark.parametrize(("failing", "named"), [("bridge", "sags bridge ros3"), ("overlay", "sags overlay")])
+def test_what_is_started_together_ends_when_a_part_fails_and_says_which(
+    failing: str, named: str, tmp_path: Path
+) -> None:
+    sags = tmp_path / "sags"
+    sags.write_text(f'#!/bin/sh\n[ "$1" = {failing} ] && exit 2\nexec sleep 60\n', encoding="utf-8")
+    sags.chmod(0o755)
+    environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "BRIDGE": "ros3"}
+    command = [ROOT / "examples/all_at_once.sh", "mine.yaml"]
+    # the pipe is closed once none of its processes is left
+    ended = subprocess.run(
+        command, env=environment, stderr=subprocess.PIPE, text=True, check=False, timeout=30
+    )
+    assert ended.returncode == 2 and ended.stderr.startswith(f"{named} ended with exit code 2")
+
+
 def following(run_dir: Path) -> AbstractContextManager[subprocess.Popen[str]]:
     """The example that follows a point."""
     command = [sys.executable, ROOT / "examples/follow_point.py", "20", "20"]

@@ -7,6 +7,7 @@ import shlex
 import signal
 import sys
 import threading
+from _thread import start_new_thread
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -182,7 +183,7 @@ def record(
 
         recorder = Recorder(options)
         on_stop_signals(recorder.stop)
-        signal.signal(signal.SIGUSR1, lambda *_: recorder.snapshot())
+        signal.signal(signal.SIGUSR1, lambda *_: start_new_thread(recorder.snapshot, ()))
         if from_stdin:
             _on_lines(recorder.snapshot, at_the_end=recorder.stop)
         if seconds is not None:

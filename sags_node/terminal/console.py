@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 import time
+from _thread import start_new_thread
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -226,7 +227,7 @@ def on_stop_signals(stop: Callable[[], None]) -> None:
         if now - first.setdefault(number, now) > SAME_SIGNAL:
             interrupt(number, frame)
         else:
-            stop()
+            start_new_thread(stop, ())  # here it could wait for a lock that what it interrupts holds
 
     signal.signal(signal.SIGINT, handle)
     signal.signal(signal.SIGTERM, handle)

@@ -270,7 +270,19 @@ def stop() -> Iterator[threading.Event]:
 def test_a_ctrl_c_that_meets_a_finaliser_is_not_lost(stop: threading.Event) -> None:
     """An exception there is printed and forgotten; a socket that is closed is such a place."""
     _Finalised()
-    assert stop.is_set()
+    assert stop.wait(60)
+
+
+@pytest.mark.fault("process: Ctrl-C and SIGTERM at the same moment")
+def test_a_signal_that_meets_the_lock_of_the_event_it_sets_is_not_waiting_for_ever(
+    stop: threading.Event,
+) -> None:
+    """SIGTERM of a script beside the terminal's Ctrl-C: the second meets the event amid `set`."""
+    lock = threading.Lock()
+    on_stop_signals(lambda: stop.set() if lock.acquire(timeout=5) else None)
+    with lock:
+        signal.raise_signal(signal.SIGTERM)
+    assert stop.wait(60)
 
 
 def test_a_script_stops_with_sigint_what_it_started_in_the_background(
