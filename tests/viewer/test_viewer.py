@@ -181,7 +181,10 @@ def test_both_eyes_stand_side_by_side_and_the_overlay_lies_on_them() -> None:
     both = Sheet().draw(overlaid, "Stereo overlay")
     assert (both[100, 50] == 90).all() and (both[100, half - 50] == (250, 0, 0)).all()
     assert (both[BAR + 10 :, half:] == 45).all(), "no overlay of the right eye came for this frame"
-    assert (both[:BAR, half:] != stereo[:BAR, half:]).any(), "which is said"
+    every = [Overlay("running"), Overlay("blank", "the node is paused"), None]
+    sheets = [Sheet().draw(replace(overlaid, overlay=overlay), "Stereo overlay") for overlay in every]
+    captions = {sheet[:BAR, half:].tobytes() for sheet in (stereo, *sheets)}
+    assert len(captions) == 4, "it came too late, it is blank, none runs: it is said"
 
 
 def test_the_depth_colours_have_the_range_of_known_depths_or_that_which_is_asked_for() -> None:
@@ -588,7 +591,13 @@ def test_the_page_counts_the_frames_that_come_to_it(narrow: Shown) -> None:
         narrow.show(at(stamp_ns) if stamp_ns else Moment("gone"))
     came = narrow.page.evaluate("sagsFrames")
     assert came["count"] == 4 and before < came["first"] < came["last"]
-    until(lambda: narrow.page.locator("#sags-rate").text_content() == "0 /s", narrow.page)
+    corner, marked = narrow.page.locator("#sags-rate"), narrow.page.locator("html[data-old]")
+    until(
+        lambda: re.fullmatch(r"0 /s: what you see came \d+ s ago", corner.text_content() or ""), narrow.page
+    )
+    assert marked.count() == 1
+    narrow.show(Moment("gone"))
+    until(lambda: corner.text_content() == "0 /s" and marked.count() == 0, narrow.page)
 
 
 def test_the_buttons_give_the_moment_that_is_shown_as_files(narrow: Shown) -> None:

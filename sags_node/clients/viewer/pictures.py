@@ -75,9 +75,8 @@ class Sheet:
             if tile is None:
                 text = f"{name}: nothing new"
             else:
-                text += (
-                    ": nothing is drawn" if name in OVERLAID and OVERLAID[name] not in moment.drawn else ""
-                )
+                if name in OVERLAID and OVERLAID[name] not in moment.drawn:
+                    text += f": {_why_bare(moment)}"
                 sheet[top + BAR : top + high, left_edge : left_edge + TILE_WIDTH] = tile
             color = _MARKED if remark else (220, 220, 220)
             cv2.putText(sheet, text, (left_edge + 6, top + 17), _FONT, 0.5, color, 1, cv2.LINE_AA)
@@ -117,6 +116,13 @@ def needs_of(view: str) -> list[str]:
 def overlaid_in(view: str) -> list[str]:
     """The eyes whose overlay a view shows."""
     return [OVERLAID[name] for name in VIEWS[view] if name in OVERLAID]
+
+
+def _why_bare(moment: Moment) -> str:
+    """Why no overlay lies on an image."""
+    if moment.overlay is None:
+        return "no overlay runs"
+    return f"no overlay, {moment.overlay.reason}" if moment.overlay.reason else "its overlay came too late"
 
 
 def _known(pictures: Mapping[str, NDArray[Any]]) -> Picture:
