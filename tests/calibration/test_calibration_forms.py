@@ -408,7 +408,7 @@ def test_what_was_looked_for_is_said(tmp_path: Path) -> None:
     message = refusal(tmp_path)
     for name in ("left.yaml and right.yaml", "calibrationdata.tar.gz", "intrinsics", "scikit-surgery"):
         assert name in message
-    assert "gone/left.yaml" in refusal(tmp_path / "gone")
+    assert "gone/left.yaml; a rig is a folder with left.yaml and right.yaml" in refusal(tmp_path / "gone")
 
 
 def test_convert(tmp_path: Path) -> None:

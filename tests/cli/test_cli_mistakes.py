@@ -91,7 +91,6 @@ REFUSED = [  # command, exit code, what is said; FILES: of `write_user_files`; N
     (f"eval {LAUNCH}/v4l2.yaml", 2, "live cameras", "record them first"),
     ("calib check FILES/calib --images FILES/left.mp4 FILES/right.mp4", 2, "left.mp4 is a video",
      "--session"),
-    ("calib check FILES/gone", 2, "gone/left.yaml"),
     ("eval VIDEOS source.frames:=2 --pace step --lpips-weights gone.npz", 2, "no file of LPIPS weights at ",
      "gone.npz"),
     # Numbers out of range.
@@ -149,13 +148,10 @@ def test_a_mistake_is_one_message_and_changes_nothing(
     ("overrides", "said"),
     [
         ({"left": "gone.mp4"}, ("gone.mp4", "does not exist", "check the path")),
-        ({"left": "garbage.mp4"}, ("garbage.mp4", "cannot be read as a video")),
         ({"right": "small.mp4"}, ("320x256", "160x128", "left.mp4", "small.mp4")),
-        ({"rig": "gone"}, ("gone/left.yaml", "a rig is a folder with left.yaml and right.yaml")),
         ({"rig": "calb"}, ("no calibration", "did you mean /", "/calib?")),
         ({"rig": "one_eyed"}, ("one_eyed/right.yaml", "No such file")),
         ({"rig": "millimetres"}, ("millimetres", "projection_matrix[3]", "by 1000")),
-        ({"rig": "positive"}, ("projection_matrix[3]", "negative")),
         ({"rig": "double"}, ("320x256", "640x512")),
     ],
     ids=str,

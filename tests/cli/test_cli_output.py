@@ -169,14 +169,6 @@ def test_figures_are_replaced_by_figures_and_nothing_else_is_printed(
 # ---- reports ---------------------------------------------------------------------------------------------
 
 
-def test_calib_check_tells_good_from_bad(user_files: Path) -> None:
-    good = sags("calib", "check", ROOT / "calib/d4d")
-    assert good.exit_code == 0 and "baseline 4.27 mm" in good.stdout and good.stderr == ""
-    bad = sags("calib", "check", user_files / "millimetres", "--json")
-    assert bad.exit_code == 1 and "cannot be used" in bad.stderr
-    assert pure_json(bad.stdout)[-1]["level"] == "error"
-
-
 @pytest.mark.parametrize(("family", "host"), [(socket.AF_INET, "127.0.0.1"), (socket.AF_INET6, "[::1]")])
 def test_doctor_finds_what_the_node_needs(
     family: int, host: str, user_files: Path, monkeypatch: pytest.MonkeyPatch

@@ -34,10 +34,8 @@ def write_user_files(folder: Path, phantom_session: Path) -> None:
     save_rig(rig, folder / "calib")
     save_rig(rig, folder / "one_eyed")
     (folder / "one_eyed/right.yaml").unlink()
-    for name, factor in (("millimetres", 1000.0), ("positive", -1.0)):
-        P = rig.right.P.copy()
-        P[0, 3] *= factor
-        save_rig(replace(rig, right=replace(rig.right, P=P)), folder / name)
+    in_mm = replace(rig.right, P=rig.right.P * [1, 1, 1, 1000])
+    save_rig(replace(rig, right=in_mm), folder / "millimetres")
     double = {
         side: replace(eye, width=640, height=512, K=doubled(eye.K), P=doubled(eye.P))
         for side, eye in (("left", rig.left), ("right", rig.right))

@@ -198,13 +198,10 @@ class Measurer:
         shown = self._run.read(now.frame.frame_id)
         if shown is not None:
             return self._shown(now, _enlarged(shown, now.pair.camera))
-        if self._measures_held_out(now.frame) and self._earlier:
+        held_out = self._options.holds_out(now.frame.frame_id)
+        if held_out and now.frame.pose_problem is None and self._earlier:  # else its camera is not known
             return self._held_out(now, self._earlier[0])
         return FrameRow(now.frame.frame_id, now.seconds, {})
-
-    def _measures_held_out(self, frame: StereoFrame) -> bool:
-        """Whether a frame is held out, and the pose of its camera is known."""
-        return self._options.holds_out(frame.frame_id) and frame.pose_problem is None
 
     def _shown(self, now: _Recorded, shown: ShownFrame) -> FrameRow:
         """The row of a shown frame: figures of what consumers got, and of the model where it is known."""
