@@ -5,7 +5,7 @@ processor while it holds the lock keeps all others waiting.
 """
 
 SHARE = 0.25  # of one core
-LEAST_SHARE = 0.05  # of one core, while the mapping is behind: less than its rate varies anyway
+LEAST_SHARE = 0.05  # of one core, if the mapping is late with every frame: less than its rate varies anyway
 BEHIND = 0.05  # share of late frames above which the mapping is behind
 LATE = 0.005  # s that a frame waits for the mapping, above which it is late
 FORGETTING = 0.03  # share of a new frame in the running mean of late ones: about a second
@@ -28,8 +28,8 @@ class Allowance:
 
     @property
     def share(self) -> float:
-        """The share of one core that drawing may use."""
-        return LEAST_SHARE if self.is_behind else SHARE
+        """The share of one core that drawing may use: the less, the more frames are late."""
+        return SHARE - self._late * (SHARE - LEAST_SHARE)
 
 
 class Pace:
