@@ -92,7 +92,8 @@ class RunDirectory:
             os.close(lock)
             raise SagsError(
                 f"another node already runs as '{self._ns}' in {self.folder}; stop it, or start this one "
-                f"with ns:=NAME {OWN_SOCKETS} (sags bag play: --ns NAME --endpoint 'tcp://127.0.0.1:*')"
+                f"with ns:=NAME {OWN_SOCKETS} (sags overlay: --own-ns NAME; sags bag play: --ns NAME "
+                "--endpoint 'tcp://127.0.0.1:*')"
             ) from None
         return lock
 

@@ -112,7 +112,7 @@ def test_one_name_one_node(tmp_path: Path) -> None:
         same = first.model_copy(update={"data": (data,), "control": control})
         other_data = same.model_copy(update={"data": first.data})
         for config, ns, said in (
-            (same, "sags", "another node already runs as 'sags' .* ns:=NAME "),
+            (same, "sags", "another node already runs as 'sags' .* ns:=NAME .*overlay: --own-ns NAME"),
             (same, "other", f"{data} is already in use"),
             (other_data, "other", f"{control} is already in use"),
         ):

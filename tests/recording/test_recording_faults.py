@@ -233,6 +233,16 @@ def test_snapshots_hold_the_last_seconds(tmp_path: Path) -> None:
     assert summary["messages"] == sum(told["messages"] for told in taken) == 5 and summary["dropped"] == 0
 
 
+def test_a_snapshot_that_is_asked_for_just_before_the_end_is_taken(tmp_path: Path) -> None:
+    """As `echo | sags bag record --stdin` asks for one, or a signal right before Ctrl-C."""
+    with recorded(tmp_path, snapshot_seconds=60) as (send, recorder, said):
+        send(text_message(1))
+        until(lambda: recorder.summary()["topics"])
+        recorder.snapshot()
+        recorder.stop()
+    assert [told["messages"] for told in said if "snapshot" in told] == [1]
+
+
 @pytest.mark.parametrize("set_by", [3600, -3600])
 def test_a_ring_keeps_its_seconds_where_the_wall_clock_is_set(set_by: int) -> None:
     """A message a second, 10 s of 30 are kept; and the camera_info of the beginning."""

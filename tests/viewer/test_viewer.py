@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,6 +16,7 @@ from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import Mock
 
 import cv2
 import msgspec
@@ -397,6 +399,21 @@ def test_open_to_the_network_it_answers_by_numbers_and_the_machines_name() -> No
         for other in ("example.org", f"{socket.gethostname()}.example.org", "10.example.org", "1.2.3.4.de"):
             assert "403 " in answered(port, *an_upgrade(f"{other}:{port}"))
             assert "403 " in answered(port, f"Host: {other}:{port}")
+
+
+@pytest.mark.fault("process: a browser that shows the viewer hangs, beside another")
+def test_a_page_that_hangs_keeps_no_other_page_waiting(viser: None) -> None:
+    """One that answers has three updates before the one that hangs is done with its first."""
+    from sags_node.clients.viewer.run import Pages
+
+    hangs, answers, goes_on = Mock(), Mock(), threading.Event()
+    hangs.local_storage.get_item.side_effect = lambda *_, **__: goes_on.wait(60)
+    with Pages() as pages:
+        for _ in range(3):
+            pages.wait({1: hangs, 2: answers})
+        assert answers.local_storage.get_item.call_count == 3
+        assert hangs.local_storage.get_item.call_count == 1
+        goes_on.set()
 
 
 # ---- in a browser ----------------------------------------------------------------------------------------

@@ -252,7 +252,7 @@ class Recorder:
         with closing(self._messages()) as messages:
             first = next(messages, None)
             tell({"recording": str(self._options.folder)})
-            for arrived in chain((first,), messages):
+            for arrived in chain((first,), messages, (None,)):  # at last what is asked for just before `stop`
                 if arrived is not None:
                     latched = is_latched(arrived.message.topic, self._options.node.ns)
                     for pushed_out in ring.add(arrived, latched):
