@@ -43,13 +43,6 @@ pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 # ---- where results go ------------------------------------------------------------------------------------
 
 
-def test_older_figures_stay_when_the_run_fails(tmp_path: Path) -> None:
-    file = tmp_path / "out.json"
-    file.write_text('{"provenance": "older figures"}')
-    refused(2, "eval", "nowhere.yaml", "--out", file, said=("nowhere.yaml",))
-    assert file.read_text() == '{"provenance": "older figures"}'
-
-
 WRITERS = [  # commands, and their options for one file
     ("eval", "--out"),
     ("eval --protocol stir DATA", "--out"),

@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from places import SESSION
 from recorded_session import Frames, both
 
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import UsageError
-from sags_node.kernels.threads import configure_threads, thread_count
+from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.ladder import Rung
 from sags_node.mapping.sags_mapper import FORGOTTEN_NS, KEPT_NS, WINDOW_NS, SagsMapper
@@ -86,23 +85,8 @@ def test_asked_for_an_earlier_time_it_shows_that_frame_better_than_it_shows_the_
     assert np.mean(np.array(gains) > 0) > 0.9
 
 
-def test_two_runs_give_the_same_bits_whatever_the_number_of_threads() -> None:
-    threads = thread_count()
-    runs = []
-    for count in (None, 1):
-        configure_threads(count)
-        pipeline, frames = pipeline_of(SESSION, "source.frames:=6")
-        runs.append(played(pipeline, frames, steps=2))
-    configure_threads(threads)
-    for a, b in zip(*runs, strict=True):
-        for name in ("means", "quats", "scales", "opacities", "colors", "ids"):
-            assert np.array_equal(getattr(a.snapshot.gaussians, name), getattr(b.snapshot.gaussians, name))
-        assert np.array_equal(a.snapshot.velocities, b.snapshot.velocities)
-        assert np.array_equal(a.views["right"].rgb, b.views["right"].rgb)
-
-
-def test_over_eight_windows_nothing_grows(phantom_session: Path) -> None:
-    small = ["vision.width:=96", "vision.height:=76", "source.loop:=true", "source.frames:=160"]
+def test_over_four_windows_nothing_grows(phantom_session: Path) -> None:
+    small = ["vision.width:=96", "vision.height:=76", "source.loop:=true", "source.frames:=80"]
     pipeline, frames = pipeline_of(phantom_session, *small)
     budget, sizes = StepBudget(1, Rung(1000)), []
     for frame in frames:

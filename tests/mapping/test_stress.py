@@ -107,15 +107,15 @@ def measured(frames: Frames) -> tuple[Frames, float]:
 
 @pytest.mark.fault("depth: NaN, infinite, negative or huge in a recording")
 @pytest.mark.parametrize("every", [10, 1])
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, -0.1, 1e30])
 def test_damage_in_a_session_s_own_depth_is_survived_and_left_behind(
-    measured: tuple[Frames, float], value: float, every: int
+    measured: tuple[Frames, float], every: int
 ) -> None:
-    """In the middle, and from the first frame on."""
+    """Of every kind, in turn; in the middle, and from the first frame on."""
     (shown, undamaged), damaged, pipeline = measured, [], fresh(FEW)
     for frame in shown:
         depth = frame.depth.copy()
-        depth.ravel()[::every] = value
+        pixels = depth.ravel()[::every]
+        pixels[:] = np.resize([*NOT_NUMBERS, -0.1], len(pixels))
         damaged.append(replace(frame, depth=depth))
     found = qualities(play(pipeline, [*shown[:2], *damaged[2:5], *shown[5:]]))
     assert min(found[2:5]) > undamaged - 3.0 and found[-1] > undamaged - 1.0

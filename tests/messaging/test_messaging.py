@@ -193,7 +193,7 @@ def test_a_late_subscriber_gets_the_last_values(running: Publisher) -> None:
         return got if sum(map(bool, got.values())) >= 4 else None
 
     with repeating(lambda _: running.poll(20)):
-        got = heard(cached, 3.0)
+        got = heard(cached, 1.0)
     assert [len(got[name]) for name in names] == [1, 1, 1, 1, 0, 0]
     assert got["splats"][0].meta["stamp_ns"] == old and got["splats"][0].meta["seq"] == 1
     assert json.loads(client.text(got["parameters"][0])) == {"mapping": {"budget_ms": 33.0}}

@@ -294,10 +294,10 @@ def test_missing_and_needless_keys_are_named_at_once(tmp_path: Path, keys: Path)
 def test_refusals_do_not_fill_the_log(tmp_path: Path, keys: Path, caplog: pytest.LogCaptureFixture) -> None:
     stranger = of(keys, "stranger")
     with caplog.at_level(logging.DEBUG, "sags_node"), node(tmp_path / "run", keys) as secured:
-        for _ in range(20):
+        for _ in range(8):
             with secured.subscriber("stranger") as subscriber:
                 until(lambda subscriber=subscriber: subscriber.refusal is not None)
-        until(lambda: secured.running.connections["data"]["unlisted_key"] == 20)
+        until(lambda: secured.running.connections["data"]["unlisted_key"] == 8)
     warnings = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
     assert len(warnings) == 2
     assert any(stranger.own.public.decode() in warning for warning in warnings)
@@ -589,7 +589,7 @@ def test_a_secured_node_as_a_process(phantom_session: Path, keys: Path, tmp_path
 
         def tf_rate(own: str) -> Result:
             by_key = ("--key", own, "--server-key", f"{keys}/node.pub") if own else ()
-            return sags("topic", "hz", "tf", "--endpoint", where, "--seconds", "1.5", "--json", *by_key)
+            return sags("topic", "hz", "tf", "--endpoint", where, "--seconds", "0.7", "--json", *by_key)
 
         # A busy machine may send none at first, and a refusal may come after the listening.
         good = until(lambda: json.loads(tf_rate(f"{keys}/clients/viewer.key").stdout or "{}"))

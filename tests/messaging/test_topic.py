@@ -94,14 +94,14 @@ def test_an_overlay_is_listed_and_measured(overlay: OverlayStream, monkeypatch: 
         rows = {row["topic"]: row for row in found}
         return rows if rows["overlay/left/overlay/image"]["rate_hz"] else None
 
-    rows = heard(listed, 2.0)
+    rows = heard(listed, 0.5)
     assert set(rows) == {f"overlay/{topic.name}" for topic in topics.OVERLAY_TOPICS}
     assert rows["overlay/left/overlay/image"]["mean_bytes"] > 4 * WIDTH * HEIGHT
     assert all(rows[f"overlay/{name}"]["messages"] for name in ("status", "right/overlay/image"))
     assert rows["overlay/right/overlay/color_key"]["type"] == topics.IMAGE
     where = NodeAddress("overlay", overlay.endpoints[-1])
     hz, bw = (
-        heard(partial(topic_figures, kind, f"left/overlay/{name}", where), 2.0)
+        heard(partial(topic_figures, kind, f"left/overlay/{name}", where), 0.5)
         for kind, name in (("hz", "color_key"), ("bw", "image"))
     )
     assert hz["window"] >= 2
@@ -124,7 +124,7 @@ def test_what_a_node_sends_beside_its_fixed_topics_is_listed(tmp_path: Path) -> 
             return rows if "sags/clock" in rows and rows["sags/clock"]["rate_hz"] else None
 
         with repeating(serve):
-            rows = heard(listed, 1.5)
+            rows = heard(listed, 0.5)
     assert set(rows) == {f"sags/{name}" for name in (*topics.BY_NAME, "clock")}
     assert rows["sags/clock"]["rate_hz"] > 0 and rows["sags/clock"]["type"] == topics.CLOCK
 
@@ -140,7 +140,8 @@ def test_echo(node: NodeAddress, name: str) -> None:
         assert 0.03 < record["content"]["min"] < record["content"]["max"] < 0.2
 
 
-def test_silence_and_mistakes_are_named(node: NodeAddress) -> None:
+def test_silence_and_mistakes_are_named(node: NodeAddress, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sags_node.messaging.introspection.STATUS_WAIT", 0.1)  # nobody says why
     with pytest.raises(UsageError, match="did you mean 'left/depth'"):
         topic_figures("hz", "left/dept", node)
     with pytest.raises(SagsError, match=r"no messages on sags/tf from tcp://127\.0\.0\.1:9 in 0\.2 s"):

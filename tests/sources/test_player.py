@@ -326,6 +326,6 @@ def test_the_clock_on_the_command_line(plane_bag: Path, tmp_path: Path) -> None:
     command = ["bag", "play", plane_bag, "--loop", "--clock", "--endpoint", "tcp://127.0.0.1:*"]
     process = start(command, XDG_RUNTIME_DIR=tmp_path)
     wait_for(process, (tmp_path / "sags/sags.json").exists)
-    figures = heard(partial(topic_figures, "hz", "clock", NodeAddress(run_dir=tmp_path / "sags")), 1.5)
+    figures = heard(partial(topic_figures, "hz", "clock", NodeAddress(run_dir=tmp_path / "sags")), 0.5)
     stopped(process)
     assert process.returncode == 0 and figures["window"] >= 2

@@ -80,8 +80,9 @@ def test_what_only_the_right_eye_sees_moves_too(width: int, height: int) -> None
     assert [watched(picture), watched(picture), watched(picture, np.roll(picture, 2, axis=0))] == [0, 1, 0]
 
 
-@SIZES
-@pytest.mark.parametrize("speed", [0.05, 0.1, -0.1])
+@pytest.mark.parametrize(
+    ("width", "height", "speed"), [*((320, 256, speed) for speed in (0.05, 0.1, -0.1)), (640, 512, 0.1)]
+)
 def test_slow_drift_adds_up_and_is_seen(width: int, height: int, speed: float) -> None:
     """Each frame alone differs from its predecessor by less than the noise."""
     watched, picture = Watched(), texture(width + 16, height)
