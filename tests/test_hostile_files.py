@@ -233,6 +233,17 @@ def test_a_video_shows_each_picture_for_as_long_as_its_stamps_say(
     np.testing.assert_allclose(np.diff(times), shown, atol=2.1 / 90_000)
 
 
+@pytest.mark.parametrize("name", ["look.png", "look.mp4"])
+def test_a_picture_that_cannot_be_saved_for_none_came_is_told_of(
+    name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    Output(tmp_path / name).close()
+    assert "is not written: no image came" in caplog.text
+    assert not (tmp_path / name).exists()
+    Output(None).close()
+    assert len(caplog.records) == 1
+
+
 def test_what_others_say_meanwhile_is_not_lost(capfd: pytest.CaptureFixture[str]) -> None:
     with native_output() as said:
         os.write(2, b"libpng warning: one\n[ WARN:0@1.5] global x.cpp:3 two\n\n")

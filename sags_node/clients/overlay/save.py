@@ -133,7 +133,7 @@ class Output:
                 log.warning("%s gets no more images: %s; the overlay goes on", self._file, error.strerror)
 
     def close(self) -> None:
-        """Finish the file.
+        """Finish the file. If no image came there is none, which is logged.
 
         Raises:
             SagsError: it cannot be written.
@@ -148,3 +148,5 @@ class Output:
             with whole(self._file) as partial:
                 partial.write_bytes(cv2.imencode(".png", self._still[..., ::-1])[1].tobytes())
             self.saved = str(self._file)
+        if self._file is not None and self.saved is None:
+            log.warning("%s is not written: no image came while the overlay ran", self._file)
