@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from sags_node.geometry import project
+from sags_node.resizing import resized_image
 from sags_node.types import F32, I64, U8, Bool, Camera, Gaussians, Shown
 
 MARGIN = np.ones((5, 5), np.uint8)  # px of the working size around a pixel that must all be tissue
@@ -108,7 +109,7 @@ class SeenFrame:
                 tissue = cv2.compare(self.whole.taken, 0, cv2.CMP_GT)
             if times > 1:
                 size = max(2, width // times), max(2, height // times)
-                picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+                picture = resized_image(picture, size)
                 tissue = cv2.resize(tissue, size, interpolation=cv2.INTER_NEAREST)
             packed = cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA)
             packed = cv2.copyMakeBorder(packed, 1, 1, 1, 1, cv2.BORDER_REPLICATE)

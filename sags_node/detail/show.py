@@ -14,6 +14,7 @@ from sags_node.detail.share import Share
 from sags_node.engine.rasterizer.views import to_view
 from sags_node.mapping.right_eye import coarse_right_eye_mask
 from sags_node.model.gaussians import for_right_eye
+from sags_node.resizing import resized_image
 from sags_node.types import F32, U8, Bool, Camera, Gaussians, Shown, Snapshot
 
 LESSON_EVERY = 4  # views drawn between lessons: what they teach changes slowly, and each costs a small view
@@ -75,7 +76,7 @@ class Detail:
         capture time of that frame, or that of `now` if nothing was carried."""
         now_ns = now.t_capture_ns
         small = coarse_camera(camera)
-        free = cv2.resize(255 * hidden, (small.width, small.height), interpolation=cv2.INTER_AREA)
+        free = resized_image(255 * hidden, (small.width, small.height))
         if not len(older) or not free.any():
             return now_ns
         wanted = cv2.dilate((free > 0).view(np.uint8), AROUND[:3, :3])  # pixels lie between coarse ones

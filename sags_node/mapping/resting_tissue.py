@@ -10,6 +10,7 @@ from sags_node.mapping.camera_pose import at_pixels, disparities_at, fit_pose
 from sags_node.mapping.first_views import FirstViews
 from sags_node.mapping.motion import Drawn, Tracks
 from sags_node.mapping.tissue_map import TissueMap
+from sags_node.resizing import resized_image
 from sags_node.types import F32, F64, I64, U8, Bool, Observation
 from sags_node.vision.watch.standing import watched_ns
 
@@ -133,7 +134,7 @@ def _is_inside(pixels: F32, picture: U8) -> Bool:
 def _most_textured(gray: U8, pixels: F32) -> I64:
     """Indices of the pixels [N, 2] that can be tracked best (J. Shi and C. Tomasi, CVPR 1994), computed at
     half the size."""
-    small = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    small = resized_image(gray, (gray.shape[1] // 2, gray.shape[0] // 2))
     texture = np.asarray(cv2.cornerMinEigenVal(small, 3))
     height, width = texture.shape
     columns, rows = (0.5 * pixels).astype(np.intp).clip(0, [width - 1, height - 1]).T

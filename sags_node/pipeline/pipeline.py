@@ -11,7 +11,6 @@ from functools import partial
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 
 from sags_node.confidence import HALVING, confidence_of
@@ -38,6 +37,7 @@ from sags_node.mapping.tissue_map import TissueMap
 from sags_node.messaging import published
 from sags_node.model.strain import SURE, Strain
 from sags_node.pipeline.results import FINDING, MOST, doubted, repeated, unseen, unsure
+from sags_node.resizing import resized_image
 from sags_node.types import (
     Bool,
     Camera,
@@ -491,7 +491,7 @@ class Pipeline:
             assert seen.right is not None  # else nothing is drawn for it
             rgb = view.rgb
             if view.shown is not None:
-                rgb = cv2.resize(view.shown.rgb, rgb.shape[1::-1], interpolation=cv2.INTER_AREA)
+                rgb = resized_image(view.shown.rgb, rgb.shape[1::-1])
             sure = by_both if judged.learn and not judged.no_stereo else np.zeros_like(by_both)
             self._right.learn(view, rgb, mapped, self.map.model, seen.right, sure, baseline)
         return view

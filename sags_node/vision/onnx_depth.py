@@ -3,11 +3,11 @@
 import logging
 import time
 
-import cv2
 import numpy as np
 
 from sags_node.config.schema import NORMALIZATIONS, OnnxConfig, VisionConfig
 from sags_node.errors import UsageError
+from sags_node.resizing import resized_image
 from sags_node.types import F32, U8, Bool, Camera, RectifiedPair
 from sags_node.vision.mono_depth import FEWEST_SAMPLES, Measure, MonoDepth
 from sags_node.vision.onnx_session import DepthNetworkError, Network, Size, has_clear_layout
@@ -65,10 +65,12 @@ class DepthNetwork(Network):
         if self._said.meaning == "depth":
             known = numbers > 0
             dividend = np.float32(self._focal_baseline if self.is_stereo else 1.0)
-            return _resized(np.divide(dividend, numbers, out=np.zeros_like(numbers), where=known), self._size)
+            return resized_image(
+                np.divide(dividend, numbers, out=np.zeros_like(numbers), where=known), self._size
+            )
         if self.is_stereo:
             numbers *= np.float32(self._size[0] / numbers.shape[1])
-        return _resized(numbers, self._size)
+        return resized_image(numbers, self._size)
 
     def _map(self, left: U8, right: U8 | None) -> F32:
         """The output's first channel [h, w], a map of the padded image or coarser."""
@@ -127,14 +129,6 @@ class DepthNetwork(Network):
             f"depth network {self.name}: {kind}, {self.description}; fed {width}x{height} px, "
             f"{cost:.0f} ms on {self.processor}"
         )
-
-
-def _resized(picture: F32, size: Size) -> F32:
-    if picture.shape[1::-1] == size:
-        return picture
-    shrinks = size[0] < picture.shape[1]
-    resized: F32 = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    return resized
 
 
 class NetworkDepth:

@@ -18,6 +18,7 @@ from sags_node.config.launch_file import explain
 from sags_node.config.schema import NORMALIZATIONS, NetworkFormat, Normalization, OnnxConfig
 from sags_node.config.yaml_reader import parse_yaml, read_yaml
 from sags_node.errors import SagsError, UsageError
+from sags_node.resizing import resized_image
 from sags_node.types import F32, U8
 
 Eye = Literal["left", "right"]
@@ -239,8 +240,7 @@ class Input:
         return np.ascontiguousarray(values[None], self.dtype)
 
     def _channels(self, picture: U8, fit: Fit, normalization: Normalization, bgr: bool) -> U8 | F32:
-        shrinks = fit.inner[0] < picture.shape[1] or fit.inner[1] < picture.shape[0]
-        fitted = cv2.resize(picture, fit.inner, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+        fitted = resized_image(picture, fit.inner)
         right, below = fit.outer[0] - fit.inner[0], fit.outer[1] - fit.inner[1]
         fitted = cv2.copyMakeBorder(fitted, 0, below, 0, right, cv2.BORDER_REPLICATE)
         mean, std = (

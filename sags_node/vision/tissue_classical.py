@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 
 from sags_node.kernels.jit import kernel
+from sags_node.resizing import resized_image
 from sags_node.types import F32, U8, Bool, RenderedView
 
 WIDTH = 320  # px that an image is shrunk to; all px below are of that
@@ -66,7 +67,7 @@ class InstrumentFinder:
         """
         height, width = image.shape[:2]
         size = min(width, WIDTH), max(1, round(height * min(1.0, WIDTH / width)))
-        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        small = resized_image(image, size)
         red, green, blue = cv2.split(cv2.blur(small, (WINDOW, WINDOW)))
         evidence, is_open = _evidence(red, green, blue)
         if expected is None:
@@ -79,7 +80,7 @@ class InstrumentFinder:
             sampled = cv2.resize(expected.colours.small, size, interpolation=cv2.INTER_NEAREST)
             drawn_red, drawn_green, drawn_blue = cv2.split(_mean(sampled * np.float32(1 / 255), WINDOW))
             doubtful = _doubtful(
-                red, green, blue, drawn_red, drawn_green, drawn_blue, _shrunk(expected.alpha, size),
+                red, green, blue, drawn_red, drawn_green, drawn_blue, resized_image(expected.alpha, size),
                 is_open, self._found, self._trusted,
             )  # fmt: skip
             found = _regions(evidence + _mean(doubtful, WINDOW))
@@ -118,7 +119,7 @@ def _widely(plane: F32) -> F32:
     """The mean within `CLIPPED_WINDOW`, [h, w]."""
     height, width = plane.shape
     coarse = max(1, width // COARSE), max(1, height // COARSE)
-    wide: F32 = cv2.resize(_mean(_shrunk(plane, coarse), CLIPPED_WINDOW // COARSE), (width, height))
+    wide: F32 = cv2.resize(_mean(resized_image(plane, coarse), CLIPPED_WINDOW // COARSE), (width, height))
     return wide
 
 
@@ -195,11 +196,6 @@ def _regions(evidence: F32) -> Bool:
 def _mean(picture: F32, window: int) -> F32:
     mean: F32 = cv2.blur(picture, (window, window))
     return mean
-
-
-def _shrunk(plane: F32, size: tuple[int, int]) -> F32:
-    shrunk: F32 = cv2.resize(plane, size, interpolation=cv2.INTER_AREA)
-    return shrunk
 
 
 def _disc(side: int) -> U8:
