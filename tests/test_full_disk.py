@@ -48,10 +48,7 @@ def there(folder: Path) -> set[str]:
 COMMANDS = {  # name -> arguments, TINY is the recording; bytes that are free, too few
     "splats": ("export --session TINY --splats DISK/x.ply", 8192),
     "points as ply": ("export --session TINY --points DISK/x.ply", 65536),
-    "points as pcd": ("export --session TINY --points DISK/x.pcd", 65536),
     "mesh as ply": ("export --session TINY --mesh DISK/x.ply", 65536),
-    "mesh as obj": ("export --session TINY --mesh DISK/x.obj", 65536),
-    "mesh as stl": ("export --session TINY --mesh DISK/x.stl", 65536),
     "orbit": ("export --session TINY --orbit DISK/x.mp4 --orbit-seconds 3", 8192),
     "render": ("export --session TINY --render DISK/x.mp4", 4096),
     "depth": ("export --session TINY --depth DISK/depth", 65536),

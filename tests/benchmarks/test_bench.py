@@ -7,21 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_line import sags
 from engine_scenes import camera, one_gaussian
 from places import ROOT
 
-from benchmarks.__main__ import main
-from benchmarks.kernels import contention, rasterizing
-from benchmarks.kernels import measure as kernels
-from benchmarks.kernels.check import SECTIONS, check, compare
+from benchmarks.kernels import rasterizing
+from benchmarks.kernels.check import SECTIONS, compare
 from benchmarks.kernels.scenes import SCENES
 from benchmarks.kernels.timing import Work, stage_clock, stage_rows
 from sags_node.engine.interface import MIN_ALPHA
 from sags_node.engine.rasterizer import compositing
 from sags_node.engine.rasterizer.layout import PAIR
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
-from sags_node.errors import UsageError
 from sags_node.kernels import peak
 from sags_node.kernels.peak import Peak
 from sags_node.kernels.threads import thread_count
@@ -116,13 +112,6 @@ def test_scenes_lie_in_the_picture(name: str) -> None:
     assert (np.median(neighbours) > 10) == (name == "shuffled")
 
 
-def test_the_busy_process_ends_with_the_measurement() -> None:
-    with pytest.raises(ZeroDivisionError), contention.burning_core() as process:
-        assert process.poll() is None
-        _ = 1 / 0
-    assert process.poll() is not None
-
-
 # ---- what is reported ------------------------------------------------------------------------------------
 
 
@@ -158,30 +147,3 @@ def test_a_kernel_twice_as_slow_is_named(kept: Table) -> None:
     slow = {name for name, ratio in found.items() if ratio == pytest.approx(2)}
     assert slow and all("rasterize composite backward" in name for name in slow)
     assert all(ratio == pytest.approx(1) for name, ratio in found.items() if name not in slow)
-
-
-def test_a_slower_machine_is_no_slower_kernel(kept: Table) -> None:
-    now = with_times(kept, 3)
-    for row in now["peaks"]:
-        row["operations_per_s"] /= 3
-        row["bytes_per_s_over"] = {size: rate / 3 for size, rate in row["bytes_per_s_over"].items()}
-    assert all(each.ratio == pytest.approx(1) for each in compare(now, kept))
-
-
-def test_a_disturbed_kernel_gets_another_try(kept: Table) -> None:
-    disturbed = with_times(kept, 3, "composite backward")
-    runs = iter([disturbed, kept])
-    assert max(each.ratio for each in check(lambda: next(runs), kept, 1.3)) == pytest.approx(1)
-    slow = [disturbed] * 3
-    assert check(slow.pop, kept, 1.3)[0].ratio == pytest.approx(3)
-    assert not slow
-    with pytest.raises(UsageError, match="no kernel in common"):
-        compare({"peaks": []}, kept)
-
-
-def test_check_on_the_command_line(kept: Table, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kernels, "measure_kernels", lambda settings, advance: with_times(kept, 2, "project"))
-    said = ("slower than in", "rasterize project")
-    result = sags("kernels", "--check", COMMITTED, command=main)
-    assert result.exit_code == 1 and all(part in " ".join(result.stderr.split()) for part in said)
-    assert sags("kernels", "--check", COMMITTED, "--tolerance", 2.1, command=main).exit_code == 0

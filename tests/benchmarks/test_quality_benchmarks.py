@@ -1,53 +1,23 @@
 """`python -m benchmarks recall`, `scope` and `tracking` on small phantoms, and followers."""
 
-import dataclasses
-import json
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
-from unittest.mock import ANY
 
 import cv2
 import numpy as np
 import pytest
-from command_line import figures_of
 from places import SESSION
 
-from benchmarks.__main__ import main
 from benchmarks.node import thin
-from benchmarks.quality import ablation, recall, scope
+from benchmarks.quality import scope
 from benchmarks.quality.followers import Csrt, Follower, dense_flow, lucas_kanade, sample
 from benchmarks.quality.tracking import measure_tracking
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import PhantomSource
 from sags_node.errors import SagsError
 from sags_node.mapping.anchors import Anchors
-from sags_node.mapping.camera_pose import exponential
 from sags_node.phantom import PhantomScene
 from sags_node.pipeline.session import open_session
-from sags_node.tools.fitting import start
-from sags_node.tools.fitting.fit import Fit
-from sags_node.tools.fitting.settings import FieldShape
-
-SMALL = [
-    *("source.seconds:=1", "source.width:=320", "source.height:=256", "source.pace:=step"),
-    *("vision.width:=320", "vision.height:=256", "mapping.max_gaussians:=8000"),
-]
-
-
-def test_most_anchors_come_back_after_the_scope_looked_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recall, "SCENARIOS", ["turned away"])
-    monkeypatch.setattr(recall, "BEFORE", 1.2)
-    monkeypatch.setattr(recall, "AFTER", 1.2)
-    found = recall.measure_recall(open_session("launch/phantom.yaml", SMALL), 2.0, lambda *_: None)
-    for key in ("reliability_px", "reliability_mm"):
-        bins = found[key]["bins"]
-        assert sum(row["count"] for row in bins) > 500
-        assert bins[-1]["right"] > max(0.9, bins[0]["right"])  # who says to be sure is
-    (row,) = found["rows"]
-    assert row["receipt"]["frames"]["count"] == round((1.2 + 2.0 + 1.2) * recall.RATE)
-    assert row["anchors"] > 30 and row["found"] > max(0.5, row["unmoved"]) and row["wrong"] < 0.1
-
 
 # ---- `benchmarks scope`: two breaths of a small phantom ------------------------------------------------
 
@@ -86,22 +56,6 @@ def test_anchors_stay_where_the_flow_goes() -> None:
     assert found["frames"][1]["motion_px"]["p90"] > 1.5  # they had to move
     assert found["receipt"]["frames"]["ids"] == "0-12"
     assert found["truth"] == "direct flow" and found["methods"]["anchors"]["average_jaccard"] is None
-
-
-def test_all_who_follow_stand_beside_on_the_true_points() -> None:
-    found = tracked(frames=range(1, 13), beside=["lucas_kanade", "dense_flow", "unmoved"])
-    methods = found["methods"]
-    assert found["truth"] == "exact" and found["anchors"] > 50
-    assert methods.keys() == {"anchors", "lucas_kanade", "dense_flow", "unmoved", "direct_flow"}
-    for name in ("anchors", "lucas_kanade", "dense_flow", "direct_flow"):
-        assert methods[name]["off_by_px"]["p50"] < 0.4 and methods[name]["sure"] > 0.7
-        assert methods[name]["average_jaccard"] > methods["unmoved"]["average_jaccard"]
-    assert methods["unmoved"]["off_by_px"]["p50"] > 0.4 and methods["unmoved"]["sure"] == 1
-    counts = [
-        sum(row["count"] for row in found["reliability_mm"][part])
-        for part in ("bins", "in_sight", "out_of_sight")
-    ]
-    assert counts[0] == 12 * found["anchors"] == counts[1] + counts[2] and min(counts) > 0
 
 
 def test_a_model_of_any_size_is_followed() -> None:
@@ -162,71 +116,7 @@ def test_what_was_lost_stays_lost(follower: Callable[[np.ndarray, np.ndarray], F
 PERIOD, ROUNDS = 40, 5
 
 
-def test_a_drift_is_told_from_a_swing() -> None:
-    """1 mm and 0.2 degrees in all; the means of first and last period are four fifths of that apart."""
-    count = PERIOD * ROUNDS
-    known = np.tile(np.eye(4), (count + 1, 1, 1))
-    estimated = []
-    for k in range(count + 1):
-        gone, swing = k / count, np.sin(2 * np.pi * k / PERIOD)
-        twist = [1e-3 * gone, 1.2e-3 * swing, 0, 0, 0, np.radians(0.2) * gone]
-        estimated.append(exponential(np.array(twist)))
-    found = scope.drift(np.stack(estimated), known, PERIOD)
-    assert found["drift_mm"] == pytest.approx(0.8, abs=1e-6) == found["worst_drift_mm"]
-    assert found["drift_deg"] == pytest.approx(0.16, abs=1e-6)
-    assert found["end_mm"] == pytest.approx(1.0, abs=1e-6)
-    assert found["end_deg"] == pytest.approx(0.2, abs=1e-6)
-
-
 # ---- `benchmarks ablation`: every variant is fitted and measured alike, on frames it never saw. ----
-
-
-def test_all_variants_are_measured_on_the_same_frames(
-    phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    small = {
-        name: dataclasses.replace(settings, shape=FieldShape(cells=8, channels=16))
-        for name, settings in ablation.VARIANTS.items()
-    }
-    monkeypatch.setattr(ablation, "VARIANTS", small)
-    monkeypatch.setattr(start, "PATH_STEPS", 20)
-    learnt: list[list[int]] = []
-    begin = Fit.start
-
-    def noted(fit: Fit, progress: Any) -> None:
-        learnt.append([frame.frame_id for frame in fit.clip.train])
-        begin(fit, progress)
-
-    monkeypatch.setattr(Fit, "start", noted)
-    out = tmp_path / "ablation.json"
-    asked = "source.frames:=12 --warm-up 2 --iterations 3 --seeds 2 --set max_gaussians=800 --json".split()
-    asked += [f"--variant={name}" for name in small if name != "nodes"]
-    found = figures_of("ablation", phantom_session, *asked, "--out", out, command=main)
-    assert json.loads(out.read_text()) == {"provenance": ANY} | found
-    assert found["receipt"]["frames"]["count"] == 12
-    del small["nodes"]
-    assert list(found["variants"]) == list(small)
-    assert learnt == [[0, 2, 3, 4, 5, 6, 7, 8]] * len(small) * 2
-    for name, rows in found["variants"].items():
-        assert len(rows) == 2 and rows[0]["heldout"] != rows[1]["heldout"], name  # of other seeds
-        row = rows[0]
-        assert row["heldout"]["frames"] == 1 and row["ahead"]["frames"] == ablation.AHEAD, name
-        assert row["gaussians"] <= 800
-        used = found["settings"][name]
-        assert used["iterations"] == 3 and used["warm_up"] == (0 if used["schedule"] == "online" else 2)
-        assert row["track"]["median_mm"] > 0 and row["track_with_ahead"]["median_mm"] > 0
-        assert row["train"]["frames"] >= 1 and row["between"]["mean"]["frames"] == 1
-        assert row["smaller"].keys() == {"half", "quarter"}
-    base, online = (found["variants"][name][0]["heldout"]["psnr"] for name in ("base", "online"))
-    assert online > base
-    filters = found["parts"]["both filters, without the block"]
-    gains = [
-        a["heldout"]["psnr"] - b["heldout"]["psnr"]
-        for a, b in zip(found["variants"]["no_adaptive"], found["variants"]["base"], strict=True)
-    ]
-    assert filters["paper_db"] == 0.9
-    assert filters["heldout"]["lowest"] == pytest.approx(min(gains), abs=1e-3)
-    assert filters["heldout"]["mean"] == pytest.approx(sum(gains) / 2, abs=1e-3)
 
 
 # ---- `benchmarks thin` on a small recording. ----

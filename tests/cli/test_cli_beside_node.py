@@ -1,10 +1,7 @@
 """Commands that listen: beside no node, beside one that has died, and beside a running one."""
 
 import json
-import re
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +9,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from click.testing import Result
 from command_line import (
     RUN_HERE,
     figures_at_last,
@@ -24,7 +20,6 @@ from command_line import (
     stopped,
     wait_for,
 )
-from places import ROOT
 from waiting import heard, until
 
 from sags_node.clients.overlay import run as overlay
@@ -95,17 +90,6 @@ def beside_node(node: Path, run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(node))
 
 
-def test_a_topic_that_says_too_little(beside_node: None) -> None:
-    def few(seconds: float) -> Result | None:
-        result = sags("topic", "hz", "parameters", "--seconds", seconds)
-        return result if "too few" in result.stderr else None
-
-    result = heard(few, 0.3)
-    assert result.exit_code == 1 and "sags/parameters" in result.stderr and "--seconds" in result.stderr
-    silent = ("topic", "hz", "clock", "--seconds", "0.3")
-    refused(1, *silent, said=("no messages", "is the node running"))
-
-
 def test_topic_tools_in_words_and_in_json(beside_node: None) -> None:
     def listed(seconds: float) -> dict[str, Any] | None:
         said = pure_json(sags("topic", "list", "--seconds", seconds, "--json").stdout)
@@ -118,12 +102,7 @@ def test_topic_tools_in_words_and_in_json(beside_node: None) -> None:
     assert rows["sags/parameters"]["messages"] == 1 and rows["sags/parameters"]["rate_hz"] is None
     assert rows["sags/right/camera_info"]["messages"] > 0
     assert "sags/left/depth" in sags("topic", "list", "--seconds", "1").stdout
-    for tool, key, unit in (
-        ("hz", "average_rate", " Hz"),
-        ("bw", "bytes_per_s", "B/s from"),
-        ("delay", "min_s", " ms"),
-    ):
-        assert pure_json(said_of("topic", tool, "left/depth", "--json"))[key] > 0
+    for tool, unit in (("hz", " Hz"), ("bw", "B/s from"), ("delay", " ms")):
         assert unit in said_of("topic", tool, "left/depth")
     two = pure_json(said_of("topic", "hz", "left/depth", "tf", "--json"))
     assert min(two[name]["average_rate"] for name in ("left/depth", "tf")) > 0
@@ -199,21 +178,6 @@ def test_anchors_are_pinned_listed_and_removed(beside_node: None) -> None:
     refused(1, "anchor", "pin", "5000", "3", said=("5000",))
 
 
-def test_the_example_follows_a_point_and_removes_it(beside_node: None) -> None:
-    """examples/follow_point.py, as its first lines say."""
-    command = [sys.executable, ROOT / "examples/follow_point.py", "160", "128", "--frames", "5"]
-
-    def followed() -> bool:
-        """In five frames; a node that missed many says that depth is a guess."""
-        done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
-        assert done.returncode == 0, done.stderr
-        return len(re.findall(r"^pixel \d+\.\d \d+\.\d  -?0\.\d{4} ", done.stdout, re.MULTILINE)) == 5
-
-    until(followed)
-    while figures_of("anchor", "list", "--json"):  # it goes with the next frame
-        pass
-
-
 def test_parameters_are_read_and_set(beside_node: None, tmp_path: Path) -> None:
     assert figures_of("param", "get", "mapping.budget_ms", "--json") == {"mapping.budget_ms": None}
     assert figures_of("param", "get", "--json")["source"]["kind"] == "folders"
@@ -257,23 +221,3 @@ def test_a_node_is_paused_resumed_and_reset(beside_node: None) -> None:
 
 
 # ---- Ctrl-C ----------------------------------------------------------------------------------------------
-
-
-def test_ctrl_c_ends_the_overlay_with_its_figures(beside_node: None, tmp_path: Path) -> None:
-    video = tmp_path / "video.mp4"
-    process = start(["overlay", "--save", video, "--json"])
-
-    def begun() -> bool:
-        return any(file.stat().st_size > 1000 for file in tmp_path.glob(".sags-*/*"))  # more than its head
-
-    wait_for(process, begun)
-    stdout, _ = stopped(process)
-    assert process.returncode == 0 and pure_json(stdout)["frames"] > 0
-    assert cv2.VideoCapture(str(video)).read()[0]
-
-
-def test_ctrl_c_ends_a_topic_tool(beside_node: None) -> None:
-    process = start(["topic", "echo", "tf"])
-    assert process.stdout.readline() == "topic: sags/tf\n"
-    stopped(process)
-    assert process.returncode == 130

@@ -32,7 +32,6 @@ pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 @pytest.mark.parametrize(
     ("command", "begun"),
     [
-        ("eval --json SESSION source.rate:=2", "sags-eval-*/*.*"),
         ("eval --pace step SESSION source.rate:=2", "sags-eval-*/*.*"),
         ("demo --json --out OUT/demo SESSION source.rate:=2", "sags-eval-*/*.*"),
         ("phantom OUT/session seconds:=60 width:=320 height:=256", ".sags-*/*/left/*.jpg"),
@@ -89,15 +88,12 @@ def __getattr__(name):
 
 
 @pytest.mark.fault("process: Ctrl-C while it starts")
-@pytest.mark.parametrize(("module", "command"), [("click", ["doctor"]), ("numba", ["overlay"])])
-def test_a_ctrl_c_while_modules_are_loaded_is_one_word(
-    module: str, command: list[str], run_dir: Path, tmp_path: Path
-) -> None:
-    """In the first moments of the command itself, and where a command loads what it needs."""
-    slow = tmp_path / f"modules/{module}/__init__.py"
+def test_a_ctrl_c_while_modules_are_loaded_is_one_word(run_dir: Path, tmp_path: Path) -> None:
+    """In the first moments of the command itself."""
+    slow = tmp_path / "modules/click/__init__.py"
     slow.parent.mkdir(parents=True)
     slow.write_text(SLOW)
-    process = start(command, PYTHONPATH=f"{tmp_path / 'modules'}:{os.environ.get('PYTHONPATH', '')}")
+    process = start(["doctor"], PYTHONPATH=f"{tmp_path / 'modules'}:{os.environ.get('PYTHONPATH', '')}")
     assert process.stdout is not None and process.stdout.readline() == "loading\n"
     stdout, stderr = stopped(process)
     assert process.returncode == 130 and (stdout, stderr) == ("", "stopped\n")

@@ -156,6 +156,6 @@ for has_gpu, wanted in ((False, "auto"), (True, "cpu")):
     device.find_gpu.cache_clear()
     warm_up(open_session({str(SESSION)!r}, ["device:=" + wanted]).config)
 assert "sags_node.mapping.mapper" in sys.modules
-print([name for name in ("torch", "warp") if name in sys.modules])
+print([name for name in ("torch", "warp", "open3d", "onnxruntime") if name in sys.modules])
 """
     assert subprocess.check_output([sys.executable, "-c", code], text=True, timeout=300) == "[]\n"

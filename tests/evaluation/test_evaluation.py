@@ -531,17 +531,6 @@ def test_views_from_aside_are_compared_with_truth_of_their_moment(monkeypatch: p
     assert looked_at == [6 / 15, 8 / 15, 10 / 15, 12 / 15]
 
 
-def test_of_a_warm_up_nothing_is_counted(session_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Boxes are hidden after 0.15 of what is measured, for half a second."""
-    monkeypatch.setattr("sags_node.tools.evaluation.second.MOST", 8)
-    for second, first, last in ((False, 12, 19), (True, 11, 17)):
-        options = MeasureOptions(0, second=second, hidden=not second)
-        outcome = evaluate(session_folder, ["source.warm_up:=10"], options)
-        hidden = [row.frame_id for row in outcome.rows if "hidden" in row.figures]
-        assert hidden == list(range(first, last + 1))
-    assert outcome.summary["second_run"] == {"frames": 8}
-
-
 def test_real_time_is_measured(session_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     played, options = ["source.rate:=10", "ns:=a/b"], MeasureOptions(hold_out=0)

@@ -32,7 +32,7 @@ from sags_node.model import columns
 from sags_node.pipeline.session import open_session
 from sags_node.quality.metrics import psnr
 from sags_node.tools.export.scene import from_fit
-from sags_node.tools.fitting import checkpoint, residuals, settings, start
+from sags_node.tools.fitting import checkpoint, residuals, start
 from sags_node.tools.fitting.clip import Clip, ClipFrame, play, read_clip
 from sags_node.tools.fitting.density import quarter
 from sags_node.tools.fitting.fit import FITTING, Fit
@@ -610,19 +610,6 @@ def test_a_clip_of_a_public_data_set_is_fitted_by_its_path(tmp_path: Path, sched
         assert found["margin_px"] == 2 and (said or " dB") in verdict["published"]
         assert ("vision.tissue.dilate:=0" in verdict["published"]) == bool(margin)
     assert found["heldout"]["frames"] == 2 and found["heldout"]["psnr"] > psnr
-
-
-@pytest.mark.usefixtures("learnt_paths")
-@pytest.mark.parametrize(
-    ("asked", "iterations"), [("", 15), ("--iterations 3", 3), ("--set iterations=4", 4)]
-)
-def test_a_fit_takes_as_many_iterations_as_its_clip_needs(
-    phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: str, iterations: int
-) -> None:
-    monkeypatch.setattr(settings, "ITERATIONS", (2, 15))  # of 5 training frames they would be 60
-    options = f"--max-gaussians 500 --json {asked} --out".split()
-    found = figures_of("fit", phantom_session, "source.frames:=6", *QUARTER, *options, tmp_path)
-    assert found["settings"]["iterations"] == iterations
 
 
 def test_a_cut_in_the_recording_keeps_the_cap(clip: Clip) -> None:

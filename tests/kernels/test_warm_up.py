@@ -45,9 +45,8 @@ print(sorted(compiled() - before))
     "settings",
     [
         (),
-        ("publish.right:=false",),  # the left view alone draws what is hidden
-        ("source.camera_motion:=sway",),
-        ("source.camera_motion:=sway", "vision.pose:=estimate"),
+        # The left view alone draws what is hidden.
+        ("publish.right:=false", "source.camera_motion:=sway", "vision.pose:=estimate"),
     ],
 )
 def test_a_warm_node_compiles_nothing_more(settings: tuple[str, ...]) -> None:

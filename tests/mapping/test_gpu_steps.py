@@ -5,14 +5,12 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
-from engine_scenes import camera, relative_error, worst_tiles
+from engine_scenes import camera, relative_error
 
 from sags_node.engine.gpu import runtime
 from sags_node.engine.gpu.rasterizer import DERIVED
 from sags_node.engine.interface import Gradients
-from sags_node.mapping import focus
 from sags_node.mapping.gpu.device_map import DeviceMap
-from sags_node.mapping.gpu.refiner import Picture
 from sags_node.mapping.optimiser import LearningRates, Optimiser
 from sags_node.model import columns
 from sags_node.model.deformation import NodeDeformation
@@ -167,18 +165,3 @@ def test_a_node_that_little_was_seen_of_stays(pair: Pair) -> None:
     pair.descend(gradients)
     pair.check_nodes()
     assert (pair.on_gpu.nodes.numpy() != before).any(axis=1).sum() <= 1
-
-
-@pytest.mark.parametrize("share", [0.0, 0.2, 0.5])
-def test_the_worst_tiles_are_the_cpus(share: float) -> None:
-    """Of an image that is no whole number of tiles, with pixels that do not count."""
-    rng = np.random.default_rng(0)
-    height, width = VIEW.height - 3, VIEW.width - 5
-    planes = rng.uniform(0, 1, (5, height, width)).astype(np.float32)
-    image = rng.integers(0, 256, (height, width, 3), np.uint8)
-    tissue = rng.uniform(size=(height, width)) < 0.8
-    expected = worst_tiles(planes, image, tissue, share)
-    picture = Picture(width, height, runtime.device_named("cpu"))
-    picture.rasterizer.planes.assign(planes)
-    picture.show(image, tissue, planes[3])
-    np.testing.assert_array_equal(focus.largest(picture.residuals(), share), expected)

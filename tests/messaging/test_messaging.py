@@ -1,10 +1,8 @@
 """The publisher over real sockets, judged by a client that knows only the wire contract."""
 
 import json
-import os
 import re
 import resource
-import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -285,16 +283,6 @@ def test_a_subscriber_that_never_reads_harms_nobody(running: Publisher) -> None:
 
 
 # ---- the loop ------------------------------------------------------------------------------------------
-
-
-def test_poll_returns_early_when_woken(running: Publisher) -> None:
-    wake = os.eventfd(0)
-    assert running.poll(1, wake) is False
-    threading.Timer(0.05, os.eventfd_write, (wake, 1)).start()
-    assert running.poll(30_000, wake) is True
-    os.eventfd_read(wake)
-    assert running.poll(0, wake) is False
-    os.close(wake)
 
 
 def _poll_until(running: Publisher, condition: Any) -> None:

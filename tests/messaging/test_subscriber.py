@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import selectors
 import subprocess
 import sys
 import threading
@@ -18,7 +17,6 @@ import pytest
 import zmq
 from independent_client import zmq_socket
 from made_messages import MS, damaged, message_of
-from places import ROOT
 from synthetic import HEIGHT, WIDTH, at_frame, health, plane_result, publisher, stream
 from waiting import until
 
@@ -255,36 +253,6 @@ def test_a_subscriber_that_nobody_closed_lets_the_program_end_in_silence(tmp_pat
 # ---- typed names ----------------------------------------------------------------------------------------
 
 
-def test_typed_names_need_no_cast(tmp_path: Path) -> None:
-    """A program of a user who lets mypy check everything."""
-    program = tmp_path / "program.py"
-    program.write_text(
-        """
-from typing import assert_type
-from sags_node.client import AsyncSubscriber, Received, ReceivedCloud, ReceivedImage, Subscriber, TopicName
-
-depth, splats = TopicName("left/render/depth", ReceivedImage), TopicName("splats", ReceivedCloud)
-with Subscriber([depth, splats]) as subscriber:
-    assert_type(subscriber.wait(depth, 1.0), ReceivedImage | None)
-    assert_type(subscriber.latest(splats), ReceivedCloud | None)
-    assert_type(subscriber.read("splats"), Received)
-    frame = subscriber.aligned([depth, splats], subscriber.read(depth).stamp_ns)
-    if frame is not None:
-        assert_type(frame[splats], ReceivedCloud)
-
-async def follow(subscriber: AsyncSubscriber) -> None:
-    assert_type(await subscriber.wait(depth, 1.0), ReceivedImage | None)
-    async for message in subscriber.messages(depth):
-        assert_type(message, ReceivedImage)
-"""
-    )
-    checked = subprocess.run(
-        [sys.executable, "-m", "mypy", "--strict", program],
-        cwd=ROOT, check=False, capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
-    assert checked.returncode == 0, checked.stdout + checked.stderr
-
-
 def test_a_typed_name_is_a_name_of_that_type() -> None:
     assert TopicName("left/render/depth", ReceivedImage) == "left/render/depth"
     assert TopicName("view/mine/depth", ReceivedImage) == "view/mine/depth"
@@ -315,30 +283,6 @@ def test_messages_are_new_ones_in_order_and_end_when_they_go_stale(running: Publ
     seen = asyncio.run(follow())
     numbers = [image.meta.seq for image in seen]
     assert len(seen) >= 10 and numbers == sorted(set(numbers))
-
-
-class Turns(selectors.DefaultSelector):
-    """Counts how often a loop goes round."""
-
-    count = 0
-
-    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        self.count += 1
-        return super().select(timeout)
-
-
-def test_a_waiting_task_sleeps(running: Publisher) -> None:
-    """Its loop goes round for the wait that begins, for its time limit, and for its end."""
-    turns = Turns()
-
-    async def wait() -> int:
-        async with subscribed(running, PICTURE, kind=AsyncSubscriber) as subscriber:
-            before = turns.count
-            assert await subscriber.wait(PICTURE, 0.5) is None
-            return turns.count - before
-
-    with asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(turns)) as runner:
-        assert runner.run(wait()) <= 3
 
 
 def test_a_cancelled_wait_leaves_others_alone(running: Publisher, monkeypatch: pytest.MonkeyPatch) -> None:

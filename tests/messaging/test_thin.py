@@ -9,9 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from independent_client import collect
-from places import SESSION
 from recorded_plane import by_topic, recording
-from running_node import RunningNode
 from synthetic import HEIGHT, WIDTH, plane_result
 from thin_sender import making, node_sockets
 from waiting import heard, until
@@ -272,19 +270,3 @@ def test_what_cannot_be_made_costs_its_topic_alone(
     assert [record.message for record in caplog.records] == [f"'{names[0]}' cannot be made"]
     monkeypatch.undo()
     assert thin_pictures(plane_result(), asked, logged)[names[0]].type == topics.COMPRESSED_IMAGE
-
-
-def test_a_running_node_sends_colour_and_depth_over_20_mbit(tmp_path: Path) -> None:
-    """At half of 640x512 px and 30 Hz, as docs/wire.md says; and the whole image comes beside."""
-    size = ("vision.width:=640", "vision.height:=512")
-    with RunningNode(SESSION, tmp_path, "source.pace:=realtime", *size) as node:
-        jpeg, png = (f"thin/half/left/render/{name}" for name in ("image/jpeg", "depth/png"))
-        came = collect(node.data, [jpeg, png, IMAGE], 20, 60)
-    assert node.process.returncode == 0
-    assert [len(messages) for messages in came.values()] == [20, 20, 20]
-    assert came[IMAGE][0].meta["shape"] == [512, 640, 4]
-    sizes = [sum(len(part) for message in came[name] for part in message.parts) / 20 for name in (jpeg, png)]
-    assert 8 * 30 * sum(sizes) < 20e6, sizes
-    colour, depth = (came[name][-1].parts[1] for name in (jpeg, png))
-    for file in (colour, depth):
-        assert cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_UNCHANGED).shape[:2] == (256, 320)

@@ -197,10 +197,3 @@ def test_a_rate_is_no_rate_of_now_once_nothing_comes_any_more(tmp_path: Path) ->
             stops = heard(measured, 3.0)
     assert stops["freezes"] > 0 and stops["frozen_s"] > 0.15
     assert "still: the sender says it is 'paused'" in hz_text(stops)
-
-
-def test_why_there_is_no_right_eye_is_said(tmp_path: Path) -> None:
-    with publisher(tmp_path / "run", right=False) as running, stream(running):
-        one_eyed = NodeAddress(endpoint=running.connection.data[-1])
-        with pytest.raises(SagsError, match=r"one camera, or with publish\.right:=false, has no right eye"):
-            topic_figures("hz", "right/render/image", one_eyed, seconds=0.2)

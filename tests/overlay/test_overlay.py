@@ -22,7 +22,6 @@ from test_overlay_drawing import KEY, centre
 from waiting import START_SECONDS, repeating, until
 
 from sags_node.clients.overlay.draw import color_key
-from sags_node.clients.overlay.frame import NEEDED
 from sags_node.clients.overlay.run import UNSEEN, OverlayOptions, run_overlay
 from sags_node.geometry import project, unproject
 from sags_node.messaging.address import NodeAddress
@@ -150,18 +149,6 @@ def test_it_waits_for_a_node_that_is_started_later(run_dir: Path, request: pytes
         assert watcher.pictures(3, drawn=True, seconds=START_SECONDS)
         session = json.loads(connection_path(run_dir, "sags").read_text())["session"]
         until(lambda: watcher.status()["session"] == session)
-
-
-@pytest.mark.fault("node: ends before its first frame has reached an overlay")
-def test_a_node_that_has_ended_as_its_first_frame_comes_is_waited_for(tmp_path: Path) -> None:
-    waiting = "waiting for the node"
-    with sockets(tmp_path) as node, overlay(tmp_path) as (running, watcher):
-        until(lambda: not node.poll(0) and all(node.wanted(str(name)) for name in NEEDED))
-        connection_path(tmp_path, "sags").unlink()
-        node.publish_result(plane_result(), 0)
-        until(lambda: watcher.status().get("reason", waiting) != waiting)
-        until(lambda: watcher.status()["reason"].startswith("stale"))  # whatever it was at first
-        assert running.is_alive()
 
 
 @pytest.mark.usefixtures("node")

@@ -9,7 +9,6 @@ import re
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
-from unittest.mock import ANY, MagicMock, call
 
 import cv2
 import numpy as np
@@ -29,22 +28,7 @@ from sags_node.confidence import confidence_of
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, quat_to_matrix, transform
 from sags_node.mapping.anchors import Anchors
-from sags_node.messaging.control import ControlClient
 from sags_node.types import F64
-
-
-def test_what_was_pinned_is_given_back_to_the_start_that_has_it() -> None:
-    client = MagicMock(spec=ControlClient)
-    client.__enter__.return_value = client
-    client.request.side_effect = [{"id": number, "session": "first"} for number in (1, 2, 3)]
-    pinner = Pinner(lambda: client)
-    assert pinner.pin([{"u": 1, "v": 2}]).result(5) == [1]
-    assert pinner.pin([{"u": 3, "v": 4}]).result(5) == [2]
-    pinner.forget([1])
-    pinner.close()
-    given_back = call("remove_anchor", {"id": 2, "session": "first"}, ANY)
-    assert client.request.call_args_list[2:] == [given_back]
-
 
 # ---- poses -----------------------------------------------------------------------------------------------
 

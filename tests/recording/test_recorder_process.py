@@ -41,14 +41,6 @@ def recorders() -> list[int]:
     return children("record")
 
 
-@pytest.mark.parametrize(
-    "args", [{"path": "a\0b"}, {"path": "a", "topics": ["left/depth\0"]}], ids=["path", "topic"]
-)
-def test_a_zero_character_is_refused(recorder: RecorderProcess, args: dict[str, object]) -> None:
-    with pytest.raises(SagsError, match="zero character"):
-        recorder.start(args).result(ANSWER)
-
-
 @pytest.mark.fault("node: it runs in a folder whose name is no text, and is to record into it")
 def test_a_folder_that_nobody_can_be_told_of_is_refused(
     recorder: RecorderProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

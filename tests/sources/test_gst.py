@@ -25,13 +25,11 @@ from sending import sending
 from waiting import beside, until
 
 from sags_node.config.launch_file import load_launch
-from sags_node.config.schema import GeometryConfig, GstSource, LaunchConfig
+from sags_node.config.schema import GeometryConfig, GstSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.sources import gst_child
 from sags_node.sources.gst import Sink, open_pipeline
 from sags_node.sources.gst_process import GstProcess, in_words
-from sags_node.tools.calibration.eyes import look
-from sags_node.tools.doctor import examine
 from sags_node.types import StereoFrame
 from sags_node.wall_clock import WallClock
 
@@ -261,11 +259,6 @@ def test_what_only_the_log_says_is_said() -> None:
     assert said == "GStreamer: the pipeline does not start (decklinkvideosrc0: Failed to acquire input)"
 
 
-def test_the_doctor_knows_what_is_installed() -> None:
-    check = dict(examine(LaunchConfig()))["GStreamer"]
-    assert check.level == "ok" and check.what.startswith("GStreamer 1.")
-
-
 # ---- to the pixel ----------------------------------------------------------------------------------------
 
 
@@ -291,43 +284,10 @@ def test_a_file_is_played_to_its_end(tmp_path: Path) -> None:
     assert np.abs(frames[0].left.astype(int) - smooth).mean() < 4  # JPEG's loss; exchanged colours: 80
 
 
-def test_interlaced_over_under_in_full_hd(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """1080i: each eye's top field to the pixel, and the rows between from it."""
-    shown = pictures(2, 1080, 1920)
-    launch = raw_file(tmp_path / "both.raw", shown, rate=30, interlaced=True)
-    geometry = GeometryConfig(layout="over_under", deinterlace="top", crop=(320, 14, 1280, 512))
-    frames, _ = take(GstSource(launch=launch, geometry=geometry), 99, size=(1280, 512))
-    assert len(frames) == 2
-    for frame, picture in zip(frames, shown, strict=True):
-        for eye, half in ((frame.left, picture[:540]), (frame.right, picture[540:])):
-            cut = half[14:527, 320:1600]  # a row more
-            assert (eye[0::2] == cut[0:512:2]).all()
-            mean = (cut[0:512:2].astype(int) + cut[2:513:2]) / 2
-            assert np.abs(eye[1::2] - mean).max() <= 0.5
-    assert "interlaced" not in caplog.text
-
-
 def test_what_nobody_deinterlaces_is_told_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     launch = raw_file(tmp_path / "both.raw", pictures(2, 48, 64), rate=30, interlaced=True)
     take(GstSource(launch=launch, geometry=GeometryConfig(layout="side_by_side")), 99)
     assert "the images are interlaced, so what moves is torn; add ! deinterlace" in caplog.text
-
-
-def test_eyes_in_turn_live_also_where_pictures_are_lost() -> None:
-    """A camera whose images are white and black in turn, to the pixel: an exchanged eye would show."""
-    camera = (
-        "videotestsrc is-live=true pattern=blink "
-        "! video/x-raw,format=RGB,width=320,height=240,framerate=60/1 ! identity drop-probability=0.2"
-    )
-    config = GstSource(launch=camera, geometry=GeometryConfig(layout="frame_sequential"))
-    frames, _ = take(config, 40)
-    tones = {(int(frame.left[0, 0, 0]), int(frame.right[0, 0, 0])) for frame in frames}
-    assert tones in ({(0, 255)}, {(255, 0)})  # nothing tells which eye the first image shows
-    for frame in frames:
-        assert (frame.left == frame.left[0, 0, 0]).all() and (frame.right == frame.right[0, 0, 0]).all()
-        assert abs(frame.t_capture_right_ns - frame.t_capture_ns - 1e9 / 60) < 1e5
-    steps = np.diff([frame.t_capture_ns for frame in frames]) * 30e-9  # pairs
-    assert (np.round(steps) > 1).any()  # some were lost
 
 
 @pytest.mark.parametrize(
@@ -358,18 +318,3 @@ def test_what_sdi_and_decoders_give_keeps_its_depth(tmp_path: Path, bits: int, t
 
 
 # ---- commands --------------------------------------------------------------------------------------------
-
-
-def test_a_picture_shows_both_eyes(tmp_path: Path) -> None:
-    """The lower half of the test image has other colours than the upper one."""
-    seen = {}
-    for first in ("left", "right"):
-        config = load_launch(ROOT / "launch/gst_over_under.yaml", [f"source.geometry.first:={first}"])
-        picture, found = look(config, 0.2)
-        assert picture.shape == (480, 2 * 640, 3)
-        assert (found["width"], found["height"], found["skew_ms"]) == (640, 480, 0)
-        # Between two lines, below the words, and beside the noise in the lower right corner.
-        seen[first] = picture[310:320, :400], picture[310:320, 640:1040]
-    assert np.abs(seen["left"][0].astype(int) - seen["left"][1]).mean() > 20
-    assert np.abs(seen["left"][0].astype(int) - seen["right"][1]).mean() < 1
-    assert np.abs(seen["left"][1].astype(int) - seen["right"][0]).mean() < 1

@@ -222,20 +222,6 @@ def test_deep_pictures_are_read(name: str, tmp_path: Path, caplog: pytest.LogCap
     assert (f"{said} taken for white" in caplog.text) == bool(said)
 
 
-def test_levels_of_folders(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """As the warning says, and other ones; without a word, and also of eight bits."""
-    bits = 4095 / 65535
-    for make, white, brighter in (
-        (counts(4095), bits, 1),
-        (counts(4095), 2 * bits, 0.5),
-        (counts(255), 0.5, 2),
-    ):
-        config = deep(tmp_path, make)
-        left = played(config.model_copy(update={"levels": (0.0, white)}))[0].left
-        assert np.abs(left / 255 - np.clip(brighter * RAMP[..., ::-1], 0, 1)).max() < max(1, brighter) / 255
-    assert caplog.text == ""
-
-
 TISSUE = {"R": 140, "G": 84, "B": 81}
 
 

@@ -96,24 +96,6 @@ def test_what_is_wrong_with_a_topic_is_said(
         read_rig(config(), seconds=0.3)
 
 
-def test_one_topic_may_show_both_eyes() -> None:
-    """Side by side, as simulators publish them."""
-    name = "/ECM/image_raw"
-    writer = Graph(RosGraph(domain=DOMAIN)).writer(name, IMAGE)
-    picture = np.zeros((120, 320, 3), np.uint8)
-    for eye in np.split(picture, 2, axis=1):
-        paint_number(eye, 7)
-
-    def send() -> None:
-        now = time.time_ns()
-        writer.write(cdr.image(picture, "rgb8", now).cdr(), now)
-
-    said = Ros2Source(domain=DOMAIN, left=name, geometry=GeometryConfig(layout="side_by_side"))
-    with Taker(RosCameras(said, (160, 120))) as taker:
-        until(lambda: send() or len(taker.numbers) >= 3)
-    assert set(taker.numbers) == {(7, 7)}
-
-
 @pytest.mark.fault("calibration: a live camera's zoom is turned, and turned back")
 @pytest.mark.parametrize("taken", [lambda rig: rig, already_rectified])
 def test_pictures_of_another_calibration_are_not_given(taken: Callable[[StereoRig], StereoRig]) -> None:

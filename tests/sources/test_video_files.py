@@ -427,17 +427,3 @@ def test_a_name_that_looks_like_an_address_or_a_pattern_is_a_name(tmp_path: Path
     (tmp_path / "list.mp4").write_text(f"#EXTM3U\n#EXTINF:1,\n{tmp_path / 'http:a.mp4'}\n#EXT-X-ENDLIST\n")
     with pytest.raises(UsageError, match="cannot be read as a video"):
         Video(tmp_path / "list.mp4")
-
-
-def test_the_check_says_what_stamps_and_pixels_say(tmp_path: Path) -> None:
-    scene = np.random.default_rng(0).integers(0, 255, (96, 148, 3), np.uint8)
-    for name, shift, lost in (("left.MTS", 0, 9), ("right.MTS", 8, 30)):
-        kept = without(lost)
-        seen = [np.roll(scene[:, shift : shift + 128], number, axis=0) for number in kept]
-        write(tmp_path / name, seen, [n / RATE for n in kept], format="mpegts", aspect=Fraction(4, 3))
-    found = check_folder(tmp_path)
-    said = "\n".join(each.what for each in found)
-    assert "error" not in {each.level for each in found} and " late" not in said
-    assert "left.MTS: its stamps have a gap behind image 8, as long as 1 images" in said
-    assert "1 and 1 images have no partner at their time" in said
-    assert "pixels are 1.33 times as wide as high" in said

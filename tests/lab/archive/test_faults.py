@@ -2,11 +2,9 @@
 disk is full, recordings are broken or hang. `quick_job` stands in for the work itself."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -122,45 +120,6 @@ def test_what_hangs_is_ended_and_retry_failed_tries_it_again(cluster: Any, tmp_p
     assert gone_through(tmp_path / "out", recordings, cluster, 1, plan)[1].quarantined == 2
     slow = replace(plan, limits=replace(plan.limits, seconds=600.0))
     assert gone_through(tmp_path / "out", recordings, cluster, 1, slow, retry_failed=True)[1].done == 2
-
-
-def test_what_changed_is_done_anew_and_the_rest_stays(cluster: Any, tmp_path: Path) -> None:
-    recordings = write_quick_recordings(tmp_path / "in", 4)
-    store, _ = gone_through(tmp_path / "out", recordings, cluster)
-    change(recordings[2], psnr=12.5)
-    assert gone_through(tmp_path / "out", recordings, cluster)[1].kept == 3
-    assert len(list((tmp_path / "out/done").iterdir())) == 4
-    assert sorted(row["online.psnr"] for row in table(store))[0] == 12.5
-
-
-def test_a_killed_worker_and_a_lost_machine(cluster: Any, tmp_path: Path) -> None:
-    """Each costs the attempt that it was at, and nothing else."""
-    signs, marker = tmp_path / "signs", tmp_path / "go on"
-    signs.mkdir()
-    recordings = write_quick_recordings(tmp_path / "in", 6, signs=str(signs))
-    change(recordings[0], waits_for=str(marker))
-    lost = cluster.add_node(num_cpus=1)
-    ends = []
-
-    def kill() -> None:
-        first = begun(signs, recordings[0])
-        os.kill(int(state_and_parent(first)[1]), signal.SIGKILL)  # Ray's worker
-        until(lambda: not is_alive(first))
-        second = until(
-            lambda: next((each for each in signs.glob("r000.*") if int(each.suffix[1:]) != first), None)
-        )
-        cluster.remove_node(lost)
-        ends.append(second)
-        marker.touch()
-
-    killer = threading.Thread(target=kill, daemon=True)
-    killer.start()
-    store, tally = gone_through(tmp_path / "out", recordings, cluster, attempts=5)
-    killer.join(PATIENCE)
-    assert ends and not killer.is_alive()
-    assert (tally.done, tally.quarantined) == (6, 0) and tally.retried >= 1
-    assert {row["state"] for row in table(store)} == {"done"}
-    assert not (tmp_path / "out/partial").exists()
 
 
 def written(folder: Path) -> dict[str, int]:
