@@ -8,7 +8,6 @@ import numpy as np
 
 from sags_node import geometry
 from sags_node.errors import SagsError, UsageError
-from sags_node.resizing import resized_image
 from sags_node.rig import rectified_camera, wrong_size
 from sags_node.types import (
     F32,
@@ -49,8 +48,8 @@ class _EyeMap:
 
     def image(self, raw: U8) -> U8:
         if self.is_rectified:
-            return resized_image(raw, self.size)
-        shrunk = resized_image(raw, self.looked_up_size)
+            return _resize(raw, self.size)
+        shrunk = _resize(raw, self.looked_up_size)
         image: U8 = cv2.remap(shrunk, self.linear[0], self.linear[1], cv2.INTER_LINEAR)
         return image
 
@@ -61,6 +60,23 @@ class _EyeMap:
         shrunk = _resize_mask(counts, self.looked_up_size)
         mask: U8 = cv2.remap(shrunk, self.nearest, None, cv2.INTER_NEAREST, borderValue=0)
         return mask.view(np.bool_)
+
+
+def _resize(picture: U8, size: tuple[int, int]) -> U8:
+    """Resizes, by area averaging only where it is needed: for ratios up to 1.5 it costs five times as much
+    for the same image, and for ratios that are not whole numbers eight times as much."""
+    height, width = picture.shape[:2]
+    if (width, height) == size:
+        return picture
+    ratios = width / size[0], height / size[1]
+    whole = int(min(ratios))
+    if whole > 1 and width % whole == height % whole == 0:
+        shrunk = cv2.resize(picture, (width // whole, height // whole), interpolation=cv2.INTER_AREA)
+        return _resize(np.asarray(shrunk), size)  # less than 1.5 is left
+    resized: U8 = cv2.resize(
+        picture, size, interpolation=cv2.INTER_AREA if max(ratios) > 1.5 else cv2.INTER_LINEAR
+    )
+    return resized
 
 
 def _resize_mask(mask: U8, size: tuple[int, int]) -> U8:
