@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1_955,
     "sags_node/tools/importing": 1_168,
     "sags_node/vision": 5_368,
-    "tests": 46_244,
+    "tests": 46_243,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

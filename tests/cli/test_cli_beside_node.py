@@ -92,8 +92,10 @@ def beside_node(node: Path, run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_topic_tools_in_words_and_in_json(beside_node: None) -> None:
     def listed(seconds: float) -> dict[str, Any] | None:
-        said = pure_json(sags("topic", "list", "--seconds", seconds, "--json").stdout)
-        rows = {row["topic"]: row for row in said}
+        said = sags("topic", "list", "--seconds", seconds, "--json").stdout
+        if not said:  # nothing came in so short a time
+            return None
+        rows = {row["topic"]: row for row in pure_json(said)}
         all_came = rows["sags/left/render/depth"]["rate_hz"] and rows["sags/parameters"]["messages"]
         return rows if all_came and rows["sags/right/camera_info"]["messages"] else None
 
@@ -218,6 +220,3 @@ def test_a_node_is_paused_resumed_and_reset(beside_node: None) -> None:
     assert sags("health").stdout.startswith("paused")
     assert figures_of("resume", "--json") == {"paused": False}
     assert "new model" in sags("reset").stdout
-
-
-# ---- Ctrl-C ----------------------------------------------------------------------------------------------
